@@ -42,7 +42,9 @@ def measured(adjoint: str, steps: int) -> dict:
     def loss(inertias):
         arm = model.replace(inertias=inertias)
 
-        motion = jd.simulate(arm, q, jnp.zeros(7), ts, solver=RK4(), stepsize=dt, adjoint=adjoint, max_steps=steps + 1)
+        motion = jd.simulate(
+            arm, q, jnp.zeros(7), ts, solver=RK4(), stepsize=jd.Steps(dt, max_steps=steps + 1), adjoint=adjoint
+        )
         return jnp.sum(motion.q[-1] ** 2)
 
     run = jax.jit((jax.jacfwd if adjoint == "forward" else jax.grad)(loss))

@@ -44,7 +44,7 @@ def box_scene(path) -> jd.Scene:
     """The file's model with its four lowest corners on the ground."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", jd.io.NotTakenWarning)  # the shape, which follows here
-        model = jd.io.load_mjcf(path).system
+        model = jd.load(path).system
     return jd.Scene(model, forces=jd.contact.shape_contacts("trunk", jd.contact.Box(SIZE), friction=FRICTION, lowest=4))
 
 
@@ -79,7 +79,7 @@ def scene(path) -> jd.Scene:
     """The file's model with its feet on the ground."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", jd.io.NotTakenWarning)  # the shapes of the feet, which follow here
-        model = jd.io.load_mjcf(path).system
+        model = jd.load(path).system
     feet = [
         jd.contact.ground_contact(f"shank_{name}", (0, 0, -LEG), FRICTION, radius=RADIUS, name=name)
         for name in ("fl", "fr", "hl", "hr")

@@ -104,7 +104,7 @@ def operational_space():
 
     ts = jnp.linspace(0, 3, 151)
     law = jd.control.OperationalSpace(model, "tip", target, KP, KD, task="position", damping=2.0)
-    motion = jd.simulate(model, q, jnp.zeros(3), ts, control=law, outputs=("pose:tip",))
+    motion = jd.simulate(model, q, jnp.zeros(3), ts, control=law, outputs=(jd.simulation.Pose("tip"),))
     errors = np.asarray(motion.poses["tip"][:, :3, 3] - jax.vmap(target)(ts))[:, [0, 2]]
     rate = -jax.jvp(target, (0.0,), (1.0,))[1]
     figure, left, right = pair()
@@ -129,7 +129,7 @@ def cartesian_stiffness():
     def push(q, v, t):
         return law(q, v, t) + jnp.where(t > 0.5, 1.0, 0.0) * (jd.frame_jacobian(model, q, "tip")[:3].T @ force)
 
-    motion = jd.simulate(model, q, jnp.zeros(3), ts, control=push, stepsize=0.002, outputs=("pose:tip",))
+    motion = jd.simulate(model, q, jnp.zeros(3), ts, control=push, stepsize=0.002, outputs=(jd.simulation.Pose("tip"),))
     moved = np.asarray(motion.poses["tip"][:, :3, 3] - place)[:, [0, 2]]
     want = np.asarray(force / stiffness)[[0, 2]]
     figure, left, right = pair()
@@ -317,7 +317,14 @@ def whole_body():
     goal = center + jnp.asarray([0.05, 0.0, -0.03])
     attitude = jd.frame_pose(model, q, "trunk")[:3, :3]
     law = jd.control.WholeBody(
-        model, feet, goal, KP, KD, orientation=attitude, posture=q, passive=(0, 1, 2), preload=1.0
+        model,
+        feet,
+        goal,
+        KP,
+        KD,
+        orientation=attitude,
+        posture=q,
+        forces=jd.control.GroundForces(preload=1.0, passive=(0, 1, 2)),
     )
     scene = jd.control.standing(model, q, feet)
     options = {

@@ -197,8 +197,7 @@ def run(name: str, seconds: float = 1.0, most: int = 4000, **options) -> tuple[C
         scene = drop.scene(mu, e)
         law = None if control is None else jax.tree_util.Partial(control)
         how = {
-            "rtol": TOLERANCE,
-            "atol": TOLERANCE,
+            "stepsize": jd.Steps(rtol=TOLERANCE, atol=TOLERANCE),
             "events": [jd.events.ModeSwitches(most)],
             "throw": False,
             **options,

@@ -40,7 +40,7 @@ def load(name):
     source = pin.buildModelFromUrdf(str(ROBOTS / file), *([pin.JointModelFreeFlyer()] if floating else []))
     if lock:
         source = pin.buildReducedModel(source, [source.getJointId(joint) for joint in lock], pin.neutral(source))
-    return jd.load_urdf(ROBOTS / file, floating_base=floating, lock=lock), source
+    return jd.load_model(ROBOTS / file, floating_base=floating, lock=lock), source
 
 
 def states(model, batch, dtype):

@@ -111,7 +111,7 @@ def mass_motion(dtypes, gradient):
         here = here.replace(inertias=here.inertias * mass[:, None])
         q, v = jnp.asarray(_Q, dtype).at[0].add(x), jnp.asarray(_V, dtype)
         ts = span * jnp.asarray([0.0, 0.5, 1.0], dtype)
-        solution = jd.simulate(here, q, v, ts, outputs=("energy",), max_steps=1024)
+        solution = jd.simulate(here, q, v, ts, outputs=("energy",), stepsize=jd.Steps(max_steps=1024))
         return outcome(solution, end=(solution.energy[1:] - solution.energy[0]) / (9.81 * jnp.sum(mass)))
 
     studied = study(run, (jnp.asarray(SERIES), jnp.asarray(spans)), dtypes, gradient)
@@ -143,7 +143,7 @@ def links(dtypes, gradient, counts=LINKS):
                 q = 0.3 * jnp.cos(jnp.arange(count, dtype=dtype))
                 v = 0.1 * jnp.sin(jnp.arange(count, dtype=dtype)) * point + x
                 ts = jnp.asarray([0.0, 0.02], dtype)
-                solution = jd.simulate(model, q, v, ts, stepsize=0.001, max_steps=32, outputs=("energy",))
+                solution = jd.simulate(model, q, v, ts, stepsize=jd.Steps(0.001, max_steps=32), outputs=("energy",))
                 mass = jnp.sum(model.inertias[:, 0])
                 return outcome(solution, end=(solution.energy[1:] - solution.energy[0]) / (9.81 * mass))
 
@@ -193,7 +193,7 @@ def twins(dtypes, gradient):
         )
         q, v = jnp.asarray([0.3, 0.2, -0.4], dtype), jnp.asarray([0.5, -0.3, 0.8], dtype).at[0].add(x)
         ts = jnp.asarray([0.0, 0.5], dtype)
-        solution = jd.simulate(model, q * unit, v * unit, ts, stepsize=stepsize, max_steps=512)
+        solution = jd.simulate(model, q * unit, v * unit, ts, stepsize=jd.Steps(stepsize, max_steps=512))
         end = jnp.concatenate([solution.q[-1] / unit, solution.v[-1] / unit])
         return outcome(solution, end=end, value=jnp.sum(end))
 

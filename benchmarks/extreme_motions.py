@@ -120,7 +120,7 @@ def run_oscillator(rate, damping, solver, count):
     system = jd.ExplicitSystem(_unit_mass, _acceleration, 1, parameters=(rate, damping))
     ts = jnp.asarray([0.0, count / 2, count], rate.dtype)
     start = jnp.zeros(1, rate.dtype), jnp.ones(1, rate.dtype)
-    solution = jd.simulate(system, *start, ts, solver=solver, stepsize=1.0, max_steps=count + 8)
+    solution = jd.simulate(system, *start, ts, solver=solver, stepsize=jd.Steps(1.0, max_steps=count + 8))
     return jnp.hypot(rate * solution.q[1:, 0], solution.v[1:, 0]), solution
 
 
@@ -207,8 +207,7 @@ def chaos(dtypes, gradient):
                 q,
                 jnp.zeros(2, dtype),
                 jnp.asarray(ts, dtype),
-                rtol=tol,
-                atol=tol,
+                stepsize=jd.Steps(rtol=tol, atol=tol),
                 outputs=("energy",),
                 adjoint="forward",
             )
@@ -300,7 +299,7 @@ def million(dtypes, gradient, count=1_000_000):
     for dtype in dtypes:
         program = quick(
             lambda q, v, ts: jd.simulate(
-                as_dtype(base, q.dtype), q, v, ts, stepsize=0.01, max_steps=2 * count, outputs=("energy",)
+                as_dtype(base, q.dtype), q, v, ts, stepsize=jd.Steps(0.01, max_steps=2 * count), outputs=("energy",)
             )
         )
         computed = program(*(jnp.asarray(x, dtype) for x in (*start, ts)))

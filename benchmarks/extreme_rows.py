@@ -37,8 +37,9 @@ def flat(dtypes, gradient, runs=FALLS):
             dtype = point.dtype
             v = v0.astype(dtype) * (point + x)
             at = jnp.asarray(ts, dtype)
-            steps = {"rtol": tolerance, "atol": tolerance} if stepsize is None else {"stepsize": stepsize}
-            options = {"method": method, "max_steps": 4096, **steps}
+            bound = tolerance if stepsize is None else None
+            steps = jd.Steps(stepsize, rtol=bound, atol=bound, max_steps=4096)
+            options = {"method": method, "stepsize": steps}
             solution = jd.simulate(
                 as_dtype(base, dtype), q0.astype(dtype), v, at, outputs=("constraint_residual",), **options
             )
@@ -103,7 +104,12 @@ def _held_by_planes(point, x, rank_tol):
     scene = jd.Scene(jd.ExplicitSystem(_mass, _no_force, 3, parameters=jnp.ones((), dtype)), (held,))
     push = _Push(jnp.stack([1.0 + x, across, jnp.ones((), dtype)]))
     zero, ts, method = jnp.zeros(3, dtype), jnp.asarray([0.0, 1.0], dtype), jd.Projected(rank_tol=rank_tol)
-    options = {"control": push, "method": method, "max_steps": 256, "outputs": ("constraint_residual",)}
+    options = {
+        "control": push,
+        "method": method,
+        "stepsize": jd.Steps(max_steps=256),
+        "outputs": ("constraint_residual",),
+    }
     solution = jd.simulate(scene, zero, zero, ts, **options)
     return outcome(solution, end=solution.q[-1], value=jnp.sum(solution.q[-1] + solution.v[-1]))
 
@@ -121,7 +127,7 @@ def bases(dtypes, gradient):
     rows, base = [], jd.scenes.four_bar(gravity=None)
     q0, v0 = jd.scenes.four_bar.start(rate=3.0)
     ts = np.array([0.0, 1.0, 2.5])
-    tight = jd.simulate(base, q0, v0, ts, rtol=1e-12, atol=1e-12)
+    tight = jd.simulate(base, q0, v0, ts, stepsize=jd.Steps(rtol=1e-12, atol=1e-12))
     exact = np.concatenate([tight.q[-1], tight.v[-1]])[None]
     choices = {"rocker": jd.Reduced((2,)), "continued": jd.Reduced(dof=1)}
     for name, method in choices.items():
@@ -135,9 +141,8 @@ def bases(dtypes, gradient):
                     v0.astype(dtype) * (point + x),
                     jnp.asarray(ts, dtype),
                     method=method,
-                    stepsize=stepsize,
+                    stepsize=jd.Steps(stepsize, max_steps=2048),
                     outputs=("constraint_residual",),
-                    max_steps=2048,
                     throw=False,
                 )
                 return outcome(solution)
@@ -253,7 +258,12 @@ def starts(dtypes, gradient):
             state = jd.assemble(scene, q, v)
             q, v, code = state.q, state.v, state.result
         solution = jd.simulate(
-            scene, q, v, jnp.asarray(ts, dtype), outputs=("constraint_residual", "energy"), max_steps=512
+            scene,
+            q,
+            v,
+            jnp.asarray(ts, dtype),
+            outputs=("constraint_residual", "energy"),
+            stepsize=jd.Steps(max_steps=512),
         )
         result = outcome(solution, end=(solution.energy[1:] - solution.energy[0]) / 50.0)
         if code is None:

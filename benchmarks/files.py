@@ -94,7 +94,7 @@ def fingerprint(m) -> str:
 def compare(path: Path, m) -> tuple[dict[str, float], str]:
     """Errors of one file by quantity, and in words what stands against comparing others. A scene that is refused has none."""
     try:
-        scene = quietly(jd.io.load_mjcf, path)
+        scene = quietly(jd.load, path)
     except ValueError as error:
         return {}, str(error).removeprefix(f"{path}: ")
     errors = quietly(agreement, path, scene)

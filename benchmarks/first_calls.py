@@ -42,7 +42,7 @@ def robot(file: str, floating: bool, lock: tuple[str, ...]):
 
     import jaxdyn as jd
 
-    model = jd.load_urdf(robot_file(file), floating_base=floating, lock=lock)
+    model = jd.load_model(robot_file(file), floating_base=floating, lock=lock)
     return model, jd.neutral(model), jnp.full(model.nv, 0.1), jnp.zeros(model.nv)
 
 
@@ -279,7 +279,7 @@ def assemble_delta() -> Callable:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "delta.xml"
             path.write_text(delta())
-            scene = jd.io.load_mjcf(path)
+            scene = jd.load(path)
         return jd.assemble(scene, scene.starts["reference"].q).q
 
     return load_and_assemble

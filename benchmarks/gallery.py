@@ -17,7 +17,8 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.hand_figure import turned_ball
-from jaxdyn.pictures.solids import Shape, Shapes, along, rod
+from jaxdyn.model import host_math
+from jaxdyn.pictures.solids import Shape, Shapes, rod
 
 # Length of the motion, s.
 SCENES = {
@@ -58,6 +59,13 @@ POINTS = {
 }
 
 
+def axle(place=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Pose (4, 4) at a place with z along y."""
+    pose = host_math.rotation_from_z(np.array([0.0, 1.0, 0.0]))
+    pose[:3, 3] = place
+    return pose
+
+
 def solids(name: str) -> Shapes | None:
     """Solids of vehicles, whose inertia alone does not show what they are; None for the default ones."""
     parts = _vehicle(name)
@@ -90,7 +98,7 @@ def _vehicle(name: str) -> list[Shape] | None:
             rod("front frame", 0.75 * steer - side, 0.75 * steer + side, 0.014),
         ]
         wheels = [
-            Shape(f"{end} wheel", "cylinder", (radius, 0.035), along((0, 0, 0), (0, 1, 0)), source="constraint")
+            Shape(f"{end} wheel", "cylinder", (radius, 0.035), axle(), source="constraint")
             for end, radius in (("rear", 0.3), ("front", 0.35))
         ]
         return [*frame, Shape("rear frame", "box", (0.25, 0.14, 0.05), at(0.2, 0, 0.64)), *fork, *wheels]
@@ -103,7 +111,7 @@ def _vehicle(name: str) -> list[Shape] | None:
                 f"{end} truck",
                 "cylinder",
                 (0.04, 0.03),
-                along((0, y, 0.04), (0, 1, 0)),
+                axle((0, y, 0.04)),
                 source="constraint",
                 color=(0.3,) * 3,
             )
@@ -120,8 +128,7 @@ def _vehicle(name: str) -> list[Shape] | None:
         ]
     if name == "differential_drive":
         wheels = [
-            Shape(f"{side} wheel", "cylinder", (0.1, 0.04), along((0, 0, 0), (0, 1, 0)), source="constraint")
-            for side in ("left", "right")
+            Shape(f"{side} wheel", "cylinder", (0.1, 0.04), axle(), source="constraint") for side in ("left", "right")
         ]
         return [
             Shape("chassis", "cylinder", (0.24, 0.1), at(0.02, 0, 0.03)),

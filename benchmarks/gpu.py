@@ -69,7 +69,7 @@ def robot(name: str):
         return jd.robots.iiwa(dtype=jnp.float32)
     if name.endswith(".urdf"):
         path = name.removeprefix("floating:")
-        return jd.load_urdf(path, floating_base=path != name, dtype=jnp.float32)
+        return jd.load_model(path, floating_base=path != name, dtype=jnp.float32)
     from benchmarks.dynamics import load
 
     return load(name)[0]

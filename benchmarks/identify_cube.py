@@ -121,7 +121,7 @@ def prediction(model: jd.Model, logs, steps: int = 10) -> tuple[float, float]:
         far.append((q, v, jnp.asarray(log.q[2 + steps])))
     q, v, end = (jnp.stack(x) for x in zip(*far, strict=True))
     ts = jnp.array([0.0, STEP * steps])
-    run = jax.jit(jax.vmap(lambda q, v: jd.simulate(model, q, v, ts, rtol=1e-8, atol=1e-10).q[-1]))
+    run = jax.jit(jax.vmap(lambda q, v: jd.simulate(model, q, v, ts, stepsize=jd.Steps(rtol=1e-8, atol=1e-10)).q[-1]))
     gap = jax.vmap(lambda a, b: jd.difference(model, a, b))(run(q, v), end)
     return tuple(float(jnp.sqrt(jnp.mean(jnp.sum(gap[:, part] ** 2, axis=1)))) for part in (slice(0, 3), slice(3, 6)))
 

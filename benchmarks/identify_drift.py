@@ -2,8 +2,9 @@
 
     python -m benchmarks.identify_drift [--seeds 12] [--recorded] [--data ../shared/data] [--out out/identify_drift.json]
 
-Held-out torque error in per cent of least squares, of the feasible fit of the four plain terms with and without weights of joints
-(v_s, prior and loss chosen), and of the automatic choice; the last column is the latter over the best of the others.
+Held-out torque error in per cent of least squares, of feasible least squares (`fit_torques`), of the feasible fit of the four
+plain terms with and without weights of joints (v_s, prior and loss chosen), and of the automatic choice; then the latter over
+the best of the others.
 
 Simulated arms have the geometry of a Panda, a KUKA KR300 and a UR5, bodies that differ from the nominal ones, an encoder with
 noise, white and slow noise of the torques, and friction that falls by up to 40 % while the arm warms up. Some have a term that no
@@ -30,7 +31,7 @@ from benchmarks.identify_franka import panda, recorded  # noqa: E402
 from benchmarks.identify_robots import ROOT, kuka, kuka_log  # noqa: E402
 from benchmarks.identify_selection import write_rows  # noqa: E402
 from jaxdyn import identify, inertia  # noqa: E402
-from jaxdyn.io.urdf import load_urdf  # noqa: E402
+from jaxdyn.io import load_model  # noqa: E402
 
 RATE = 250.0
 LEFT_OUT = {"drift": 0.8, "stribeck": 0.5, "load": 0.4, "spring": 0.4, "ripple": 0.5, "asymmetric": 0.3, "dahl": 0.4}
@@ -44,7 +45,7 @@ def arm(number: int) -> jd.Model:
     if number < 2:
         return (panda, kuka)[number]()
     robots = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")))
-    return load_urdf(robots / "ur_description/urdf/ur5_robot.urdf").replace(damping=None, friction=None)
+    return load_model(robots / "ur_description/urdf/ur5_robot.urdf").replace(damping=None, friction=None)
 
 
 def motion(rng, t: np.ndarray, nv: int, base: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -130,10 +131,11 @@ def recorded_cases(folder: Path) -> Iterator[Case]:
 
 
 def compare(model: jd.Model, train: list[identify.Log], test: identify.Log) -> tuple[list[float], str]:
-    """Errors of the four fits, and the setting that was chosen."""
+    """Errors of the five fits, and the setting that was chosen."""
     chosen = identify.fit_robot(model, train)
     fits = [
         identify.least_squares(model, train),
+        identify.fit_torques(model, train),
         identify.fit_robot(model, train, identify.TERMS).fit,
         identify.fit_robot(model, train, identify.TERMS, weights=None).fit,
         chosen.fit,

@@ -20,7 +20,7 @@ import numpy as np  # noqa: E402
 
 from jaxdyn import identify  # noqa: E402
 from jaxdyn.constraints.codes import name_of  # noqa: E402
-from jaxdyn.io.urdf import load_urdf  # noqa: E402
+from jaxdyn.io import load_model  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -44,7 +44,7 @@ def panda():
     """The Panda without fingers and without the placeholder friction of its URDF."""
     robots = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")))
     path = robots / "panda_description/urdf/panda.urdf"
-    model = load_urdf(path, lock=("panda_finger_joint1", "panda_finger_joint2"))
+    model = load_model(path, lock=("panda_finger_joint1", "panda_finger_joint2"))
     return model.replace(damping=None, friction=None)
 
 

@@ -123,7 +123,7 @@ def ours(case: Case, data: Path, limit: float) -> dict:
     from jaxdyn import identify
     from jaxdyn.constraints.codes import name_of
     from jaxdyn.identify.condensed_fit import Setting
-    from jaxdyn.identify.robot_problem import RobotProblem
+    from jaxdyn.identify.robot_logs import RobotLogs
     from jaxdyn.simulation.solvers import RK4
 
     model, log, bodies = problem(case, data)
@@ -144,7 +144,7 @@ def ours(case: Case, data: Path, limit: float) -> dict:
 
         if case.by == "fit_torques":
             # All bodies at once, by the convex fit; its loss has a prior, which here weighs next to nothing.
-            robot = RobotProblem(model, (log,), (), (), "full", 1)
+            robot = RobotLogs(model, (log,), (), (), "full", 1)
             robot.weights = weights
             estimate = robot.fit(Setting(0.01, (), PRIOR), callback=watch)
             fit, end = robot.result(Setting(0.01, (), PRIOR), estimate), time.perf_counter() - begun

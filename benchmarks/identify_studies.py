@@ -27,7 +27,7 @@ from benchmarks.identify_franka import panda, recorded, samples  # noqa: E402
 from benchmarks.identify_robots import ROOT, kuka, kuka_log, kuka_samples  # noqa: E402
 from jaxdyn import identify  # noqa: E402
 from jaxdyn.identify.logs import filter_like_log  # noqa: E402
-from jaxdyn.identify.workflows.raw_logs import vibration  # noqa: E402
+from jaxdyn.identify.raw_logs import vibration  # noqa: E402
 
 CUTOFFS = (3.5, 5.0, 6.5, 8.0, 10.0, 15.0, 20.0)
 COMMON = 2.5

@@ -68,7 +68,7 @@ def delta_robot():
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "delta.xml"
         path.write_text(delta())
-        scene = jd.io.load_mjcf(path)
+        scene = jd.load(path)
     return Case(scene, ["plate"], scene.starts["reference"].q)
 
 

@@ -27,7 +27,7 @@ def solo():
     """Our model, Pinocchio's, and a crouched configuration: positions and unit quaternion (w first here, last there), joints."""
     folder = Path(pin.__file__).parents[4] / "share" / "example-robot-data" / "robots"
     path = next(folder.rglob("solo12.urdf"))
-    model = jd.load_urdf(str(path), floating_base=True)
+    model = jd.load_model(str(path), floating_base=True)
     source = pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer())
     q = np.array(jd.neutral(model))
     for name, part in zip(model.joint_names, model.topology.q_slices, strict=True):

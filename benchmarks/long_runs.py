@@ -40,7 +40,7 @@ class Integration(NamedTuple):
 
 def integrations(step: float) -> list[Integration]:
     """Variational steps, RK4 steps of the same lengths, and tolerances."""
-    steps = {f"{h:g} s": {"stepsize": h} for h in (step, step / 2)}
+    steps = {f"{h:g} s": {"size": h} for h in (step, step / 2)}
     tolerances = {f"{tol:g}": {"rtol": tol, "atol": tol} for tol in (1e-6, 1e-10)}
     return [
         Integration("variational", {"method": "variational"}, steps),
@@ -58,7 +58,8 @@ def measure(name: str, length: float) -> Iterator[dict]:
     for integration in integrations(step):
 
         def run(q, v, numbers, options=integration.options):
-            return jd.simulate(scene, q, v, ts, outputs=outputs, max_steps=2**24, throw=False, **options, **numbers)
+            steps = jd.Steps(**numbers, max_steps=2**24)
+            return jd.simulate(scene, q, v, ts, outputs=outputs, stepsize=steps, throw=False, **options)
 
         compiled = jax.jit(run).lower(q, v, next(iter(integration.numbers.values()))).compile()
         for label, numbers in integration.numbers.items():

@@ -29,7 +29,7 @@ def scene(points: int) -> jd.Scene:
         warnings.simplefilter("ignore", jd.io.NotTakenWarning)
         path = Path(folder) / "quadruped.xml"
         path.write_text(mjcf())
-        model = jd.io.load_mjcf(path).system
+        model = jd.load(path).system
     feet = [
         jd.contact.ground_contact(f"shank_{leg}", place, FRICTION, name=f"{leg}{i}")
         for leg in ("fl", "fr", "hl", "hr")

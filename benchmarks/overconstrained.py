@@ -242,7 +242,7 @@ def row(title: str, mechanism: Mechanism) -> list[str]:
 
     steps, errors, ratios = [], [], []
     for tolerance in TOLERANCES:
-        motion, (_, least) = end(rtol=tolerance, atol=tolerance), mechanism.minimal(times, tolerance)
+        motion, (_, least) = end(stepsize=jd.Steps(rtol=tolerance, atol=tolerance)), mechanism.minimal(times, tolerance)
         taken = int(motion.stats["num_accepted_steps"])
         steps.append(str(taken) if bool(motion.success) else "failed")
         errors.append(f"{distance(motion.q[-1], exact):.0e}")

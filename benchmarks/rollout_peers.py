@@ -80,7 +80,7 @@ def with_mujoco(model, q, v, tau, steps: int):
 def robot(name: str, batch: int, steps: int, of_mjx: int, mjx_g1: bool) -> dict:
     """Calls that return the last positions of a batch, by the library's name."""
     file, _, lock = FILES[name]
-    model = jd.load_urdf(ROBOTS / file, lock=lock).replace(damping=None, friction=None)
+    model = jd.load_model(ROBOTS / file, lock=lock).replace(damping=None, friction=None)
     q, v, tau = (0.5 * x for x in np.random.default_rng(0).normal(size=(3, batch, model.nv)))
     ts = DT * np.array([0.0, steps])
 

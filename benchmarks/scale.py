@@ -29,6 +29,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
 
 import jax
@@ -40,9 +41,15 @@ from benchmarks.operations import operations
 from jaxdyn.scale import study
 from jaxdyn.tasks import Cluster
 
-QUIET = {"progress": False}
+OF_RESOURCES = [one.name for one in fields(jd.scale.Resources)]
 COLLECTIVES = "all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast"
 CACHE = "JAX_COMPILATION_CACHE_DIR"
+
+
+def grouped(options: dict) -> dict:
+    """Options of a run with those of `jd.scale.Resources` among them in one object."""
+    own = {"progress": False} | {name: options.pop(name) for name in OF_RESOURCES if name in options}
+    return options | {"resources": jd.scale.Resources(**own)}
 
 
 def arm(samples: int, out, **options):
@@ -54,7 +61,7 @@ def arm(samples: int, out, **options):
         return {"q": jax.random.uniform(one, (7,), minval=-1.0, maxval=1.0), "v": jax.random.normal(other, (7,))}
 
     ts = np.linspace(0.0, 0.4, 11)
-    options = {"stepsize": 1e-3, "samples": samples, "out": out} | QUIET | options
+    options = {"stepsize": 1e-3, "samples": samples, "out": out} | grouped(options)
     return jd.scale.run(model, lambda p: (p["q"], p["v"]), draw, ts, **options)
 
 
@@ -70,7 +77,7 @@ def disks(samples: int, out, points: int = 100, **options):
         return jnp.zeros(4), jnp.stack([2.0 * p["radius"], 0.0 * one, one, 2.0 * one])
 
     ts = np.linspace(0.0, 1.0, points)
-    options = {"stepsize": 0.01, "samples": samples, "out": out} | QUIET | options
+    options = {"stepsize": 0.01, "samples": samples, "out": out} | grouped(options)
     return jd.scale.run(lambda p: jd.scenes.rolling_disk(**p), start, draw, ts, **options)
 
 
@@ -214,12 +221,15 @@ def workers(folder: Path, samples: int) -> None:
 
 def tasks(folder: Path, samples: int) -> None:
     """What a chunk costs that costs nothing, and what a task does; memory against their number."""
-    options = {"chunk": 1, "batch_size": 1, "rows": False} | QUIET
+    options = {"chunk": 1, "batch_size": 1, "rows": False}
     small = {"x": np.arange(float(samples))}
     with cluster(2) as client:
         for name, place in (("in this process", None), ("on two workers", client)):
             run = jd.scale.evaluate(
-                lambda p: {"y": p["x"] + 1.0}, small, out=folder / f"{name}.zarr", client=place, **options
+                lambda p: {"y": p["x"] + 1.0},
+                small,
+                out=folder / f"{name}.zarr",
+                **grouped({"client": place, **options}),
             )
             print(f"tasks: {samples} chunks of one rollout {name}: {1e3 * run.seconds / samples:.2f} ms each")
         with Cluster(client) as many:

@@ -143,7 +143,7 @@ def programs(rung: Rung, batch: int, steps: int):
     made = {"acceleration": built(accelerate)}
     if steps:
         ts = jnp.asarray([0.0, STEP * steps], dtype)
-        options = {"stepsize": STEP, "outputs": rung.outputs, "throw": False, "max_steps": 2 * steps}
+        options = {"stepsize": jd.Steps(STEP, max_steps=2 * steps), "outputs": rung.outputs, "throw": False}
         made["simulation"] = built(lambda q, v: jd.simulate(scene, q, v, ts, **options))
         if scene.constraints:
             made["projection"] = built(lambda q, v: project_state(scene, q, v, jnp.zeros((), dtype)))

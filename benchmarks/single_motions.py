@@ -42,7 +42,7 @@ def measure(name: str, rounds: int, clock: str) -> dict:
     ts = jnp.linspace(0.0, 1.0, 21)
 
     def motion(scene, q, v, throw):
-        moved = jd.simulate(scene, q, v, ts, rtol=1e-8, atol=1e-8, throw=throw)
+        moved = jd.simulate(scene, q, v, ts, stepsize=jd.Steps(rtol=1e-8, atol=1e-8), throw=throw)
         return moved.q, moved.result
 
     known = jax.jit(lambda q, v: motion(scene, q, v, False))

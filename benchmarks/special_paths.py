@@ -34,7 +34,7 @@ def motion(name: str, points: int, batch: int = 0) -> Callable:
     ts = jnp.linspace(0.0, 1.0, points)
 
     def one(scene, q, v):
-        return jd.simulate(scene, q, v, ts, rtol=1e-8, atol=1e-8, throw=False).q
+        return jd.simulate(scene, q, v, ts, stepsize=jd.Steps(rtol=1e-8, atol=1e-8), throw=False).q
 
     if not batch:
         run = jax.jit(one)

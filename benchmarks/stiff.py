@@ -222,17 +222,18 @@ def cases() -> dict[str, Case]:
     return {case.name: case for case in all_of}
 
 
-def program(case: Case, solver, dtype=float, **options) -> Callable:
+def program(case: Case, solver, dtype=float, size=None, max_steps=None) -> Callable:
     """A function (stiffness, tolerance) -> (q (nt, nq), dq/d log(stiffness), steps, result), to be batched and compiled."""
 
     def run(log, tolerance):
         scene, control, q0, v0 = case.build(jnp.exp(log))
         if dtype is not float:
             scene, control = jax.tree.map(lambda x: x.astype(dtype), (scene, control))
-        tolerances = {"rtol": tolerance, "atol": tolerance, "throw": False}
-        solution = jd.simulate(
-            scene, q0, v0, case.ts, control=control, solver=solver, adjoint="forward", **tolerances, **options
-        )
+        # Explicit steps of a given length have no use for a tolerance.
+        bound = None if isinstance(solver, jd.solvers.RK4) else tolerance
+        steps = jd.Steps(size, rtol=bound, atol=bound, max_steps=max_steps)
+        options = {"control": control, "solver": solver, "stepsize": steps, "adjoint": "forward", "throw": False}
+        solution = jd.simulate(scene, q0, v0, case.ts, **options)
         return solution.q, (solution.stats["num_steps"], solution.success, code_of(solution.result))
 
     def both(stiffness, tolerance):
@@ -245,7 +246,7 @@ def program(case: Case, solver, dtype=float, **options) -> Callable:
 
 def runner(case: Case, solver, dtype=float) -> Callable:
     """A function (tolerance) -> positions, derivatives, steps, success and code at all stiffnesses of a case, in numpy."""
-    options = {"stepsize": FIXED_STEP} if isinstance(solver, jd.solvers.RK4) else {"max_steps": MOST_STEPS}
+    options = {"size": FIXED_STEP} if isinstance(solver, jd.solvers.RK4) else {"max_steps": MOST_STEPS}
     run = jax.jit(jax.vmap(program(case, solver, dtype, **options), (0, None)))
     return lambda tolerance: tuple(
         np.asarray(x) for x in run(jnp.asarray(case.values, dtype), jnp.asarray(tolerance, dtype))

@@ -4,8 +4,7 @@ import json
 import time
 from pathlib import Path
 
-from jaxdyn.reports import timing
-from jaxdyn.reports.timing import time_interleaved as time_interleaved
+from jaxdyn.reports.run import time_interleaved as time_interleaved
 
 OUT = Path(__file__).resolve().parent.parent / "out"
 

@@ -30,6 +30,8 @@ _HOMES, __all__ = _read_stub()
 
 def __getattr__(name: str) -> Any:
     """Import a name at its first use (PEP 562); AttributeError for others."""
+    if name == "load_urdf":  # a deprecated name, which warns when it is called
+        return importlib.import_module("jaxdyn.io").load_urdf
     if name not in _HOMES or name not in __all__:
         # Subpackages that are not public are attributes too, as after `import jaxdyn.compile`.
         if not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}") is not None:

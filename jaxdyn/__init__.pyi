@@ -26,7 +26,7 @@ from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.branches import degrees_of_freedom
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.constraints.reactions import constraint_forces
+from jaxdyn.constraints.frames import constraint_forces
 from jaxdyn.control.following import follow
 from jaxdyn.control.inverse_kinematics import inverse_kinematics
 from jaxdyn.dynamics.centroidal import center_of_mass, com_jacobian, kinetic_energy, potential_energy
@@ -42,7 +42,7 @@ from jaxdyn.dynamics.quantities import (
     mass_matrix,
 )
 from jaxdyn.exports import Exported, export
-from jaxdyn.io import load, load_urdf, read_log, save_urdf
+from jaxdyn.io import load, load_model, read_log, save_urdf
 from jaxdyn.lie import se2, se3, so3
 from jaxdyn.model import inertia, robots
 from jaxdyn.model.builder import ModelBuilder
@@ -63,6 +63,7 @@ from jaxdyn.reports import report
 from jaxdyn.simulation import events, solvers
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Multipliers, Projected, Reduced
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.simulation.stepping import stepper
@@ -90,6 +91,7 @@ __all__ = [
     "Sampled",
     "Scene",
     "Solution",
+    "Steps",
     "Variational",
     "animate",
     "assemble",
@@ -133,7 +135,7 @@ __all__ = [
     "join",
     "kinetic_energy",
     "load",
-    "load_urdf",
+    "load_model",
     "loop",
     "mass_matrix",
     "model",

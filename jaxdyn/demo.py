@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdyn as jd
+from jaxdyn.identify.excitation import Tracking, random_motion, random_torque
 from jaxdyn.identify.replay import segments
-from jaxdyn.identify.workflows.excitation import Tracking, random_motion, random_torque
 from jaxdyn.reports.plotting import BLUE, GREY, ORANGE, RED, bands, new_figure
 
 # Standard deviation of the random torques of each joint (N m), about a tenth of what the arm's weight asks for.
@@ -98,7 +98,7 @@ def experiment(model, nominal, samples: int):
     def run(motion):
         control = Tracking(nominal, motion, *gains)
         q, v, _ = motion(0.0)
-        solution = jd.simulate(model, q, v, ts, control=control, stepsize=0.005, max_steps=4096, throw=False)
+        solution = jd.simulate(model, q, v, ts, control=control, stepsize=jd.Steps(0.005, max_steps=4096), throw=False)
         return solution.q, solution.v, jax.vmap(control)(solution.q, solution.v, jnp.asarray(ts))
 
     rng = np.random.default_rng(0)

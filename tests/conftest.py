@@ -23,8 +23,8 @@ if os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "least" and "XLA_FLAGS" not i
     os.environ["XLA_FLAGS"] = " ".join(flags)
 
 import jax
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -40,7 +40,7 @@ jax.config.update("jax_traceback_in_locations_limit", 0)
 ROOMS = sorted(
     path.name for path in (ROOT / "jaxdyn").iterdir() if (path / "__init__.py").exists() and path.name != "compile"
 )
-install_import_hook([f"jaxdyn.{room}" for room in ROOMS], "beartype.beartype")
+jaxtyping.install_import_hook([f"jaxdyn.{room}" for room in ROOMS], "beartype.beartype")
 
 # Traces are large graphs of objects that live as long as the process: the collector would walk through them again and again.
 gc.set_threshold(200_000, 20, 50)
@@ -111,6 +111,14 @@ def mode(request: pytest.FixtureRequest) -> Iterator[str]:
 
     with jaxdyn.compilation(request.param):
         yield request.param
+
+
+@pytest.fixture
+def as_users_have_it() -> Iterator[None]:
+    """Without the checks of annotations that the tests put before all functions."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

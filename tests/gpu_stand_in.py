@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxdyn.compile import objects, primitive
 from jaxdyn.compile.code import varying_first
-from jaxdyn.compile.gpu import driver, ptx
+from jaxdyn.compile.gpu import device, ptx
 
 HOST_SAMPLE = """@jaxdyn_sample = thread_local global i64 0
 define internal i64 @sample() {
@@ -110,7 +110,7 @@ class StandInDriver:
         self.capability, self.version, self.devices = capability, version, devices
         self.launches, self.loaded, self.contexts, self.kernels = [], [], [], {}
         self.fails, self.refusal, self.registers = None, None, 80
-        for name, arguments in driver._FUNCTIONS.items():
+        for name, arguments in device._FUNCTIONS.items():
             function = functools.partial(self._run, name, getattr(self, f"_{name}"))
             setattr(self, name, ctypes.CFUNCTYPE(_I, *[_kind(x) for x in arguments])(function))
 

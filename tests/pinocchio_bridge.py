@@ -14,7 +14,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 from xla_options import QUICK
 
-from jaxdyn.io import load_urdf
+from jaxdyn.io import load_model
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology
 
@@ -324,7 +324,7 @@ ROBOT_FILES = _paths()
 def load_both(file, floating):
     """The robot on both sides, and the conversion of configurations."""
     source = pin.buildModelFromUrdf(ROBOT_FILES[file], *([pin.JointModelFreeFlyer()] if floating else []))
-    model = load_urdf(ROBOT_FILES[file], floating_base=floating)
+    model = load_model(ROBOT_FILES[file], floating_base=floating)
     extra = [
         joint.nq - (part.stop - part.start)
         for joint, part in zip(list(source.joints)[1:], model.topology.q_slices, strict=True)

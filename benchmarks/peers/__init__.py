@@ -17,7 +17,7 @@ import importlib
 import time
 from collections.abc import Callable, Sequence
 
-from jaxdyn.reports.measurement import Contestant
+from jaxdyn.reports.run import Contestant
 
 MODULES = ("symbolic", "compiled", "with_mujoco", "with_pinocchio", "with_mjx", "with_pydy")
 # Peers that take equations and run them from start to end in compiled code, by the beginning of their source.

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.peers.equations import EQUATIONS, Equations
 from benchmarks.peers.steps import CORES, TOLERANCES, steps_between
-from jaxdyn.reports.measurement import Contestant, Motion
+from jaxdyn.reports.run import Contestant, Motion
 
 COMPILER = shutil.which(os.environ.get("CC", "cc"))
 MOST_STEPS = 2**14

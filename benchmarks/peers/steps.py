@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from scipy.integrate import ode, odeint
 
-from jaxdyn.reports.measurement import Contestant, Motion
+from jaxdyn.reports.run import Contestant, Motion
 
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10)

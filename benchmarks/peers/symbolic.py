@@ -13,7 +13,7 @@ import sympy
 
 from benchmarks.peers.equations import EQUATIONS, Equations
 from benchmarks.peers.steps import dop853, lsoda, rk4
-from jaxdyn.reports.measurement import Contestant
+from jaxdyn.reports.run import Contestant
 
 # Beyond this many unknowns dense NumPy code, filled entry by entry, is no sensible way to write equations.
 LARGEST = 20

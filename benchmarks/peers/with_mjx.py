@@ -11,7 +11,7 @@ from mujoco import mjx
 from benchmarks.peers.steps import steps_between
 from benchmarks.peers.twins import TWINS
 from benchmarks.peers.with_mujoco import INTEGRATORS, STAGES, to_mujoco
-from jaxdyn.reports.measurement import Contestant, Motion
+from jaxdyn.reports.run import Contestant, Motion
 
 SCENES = ("double_pendulum", "free_body")
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.peers.steps import CORES, steps_between
 from benchmarks.peers.twins import TWINS, Twin
-from jaxdyn.reports.measurement import Contestant, Motion
+from jaxdyn.reports.run import Contestant, Motion
 
 INTEGRATORS = {
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,

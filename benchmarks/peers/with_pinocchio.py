@@ -14,7 +14,7 @@ import jaxdyn as jd
 from benchmarks.constraints import to_pinocchio
 from benchmarks.peers.steps import CORES, dop853, rk4
 from benchmarks.peers.twins import TWINS, Twin
-from jaxdyn.reports.measurement import Contestant
+from jaxdyn.reports.run import Contestant
 
 SOURCE = f"Pinocchio {pin.__version__}"
 

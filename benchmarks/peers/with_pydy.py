@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from sympy.physics.mechanics import KanesMethod, Point, ReferenceFrame, RigidBody, dynamicsymbols, inertia
 
 from benchmarks.peers.steps import dop853
-from jaxdyn.reports.measurement import Contestant
+from jaxdyn.reports.run import Contestant
 
 # Generated code has to have a constant.
 MASS = sympy.Symbol("mass")

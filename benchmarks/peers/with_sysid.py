@@ -3,6 +3,8 @@
 Torques are compared by `mj_inverse` at every sample, as its rollouts have no inverse dynamics; motion by its own rollouts in C.
 """
 
+import contextlib
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -50,8 +52,26 @@ def parameters(spec: mujoco.MjSpec, bodies: Sequence[str]) -> sysid.ParameterDic
     return free
 
 
+def joint_parameters(spec: mujoco.MjSpec, joints: Sequence[str], sizes: np.ndarray) -> list[sysid.Parameter]:
+    """Viscous and Coulomb friction and rotor inertia of each joint, and its offset, which `torque_residual` adds.
+
+    `sizes` (2, nv): root mean square of velocities and of torques, by which the bounds are set.
+    """
+    free = []
+    for k, (joint, speed, torque) in enumerate(zip(joints, *sizes, strict=True)):
+
+        def change(spec, param, joint=joint):
+            place = spec.joint(joint)
+            place.damping[0], place.frictionloss, place.armature = param.value
+
+        most = np.array([torque / speed, torque, torque / speed])
+        free.append(sysid.Parameter(f"joint {joint}", 0.05 * most, 1e-6 * most, most, modifier=change))
+        free.append(sysid.Parameter(f"offset {k}", 0.0, -torque, torque))
+    return free
+
+
 def torque_residual(spec: mujoco.MjSpec, log, scale: np.ndarray):
-    """Errors of the torques along a log, over `scale` (nv,)."""
+    """Errors of the torques along a log, over `scale` (nv,); parameters "offset 0" and so on are added to the torques."""
     model = spec.compile()
     padded = np.concatenate([log.q, log.v], axis=1)
     start = sysid.create_initial_state(model, log.q[0], log.v[0])
@@ -73,7 +93,10 @@ def torque_residual(spec: mujoco.MjSpec, log, scale: np.ndarray):
         ]
 
     def residual(params, predicted, measured, model, return_pred_all, state, **_):
-        return (state[:, 1:] - log.tau) / scale[None], measured, measured
+        offset = np.array(
+            [params[f"offset {k}"].value[0] if f"offset {k}" in params else 0.0 for k in range(len(scale))]
+        )
+        return (state[:, 1:] + offset - log.tau) / scale[None], measured, measured
 
     return sysid.build_residual_fn(
         models_sequences=[sequence], custom_rollout=rollout, modify_residual=residual, resample_true=False
@@ -88,6 +111,13 @@ def inverse(model: mujoco.MjModel, data: mujoco.MjData, log) -> np.ndarray:
         mujoco.mj_inverse(model, data)
         torques[i] = data.qfrc_inverse
     return torques
+
+
+def predicted(spec: mujoco.MjSpec, free: sysid.ParameterDict, log) -> np.ndarray:
+    """Torques (n, nv) along a log with the values of the parameters."""
+    model = sysid.apply_param_modifiers(free, spec.copy())
+    torques = inverse(model, mujoco.MjData(model), log)
+    return torques + np.array([free[f"offset {k}"].value[0] for k in range(model.nv)])
 
 
 def motion_residual(spec: mujoco.MjSpec, pieces, scale: np.ndarray):
@@ -114,12 +144,14 @@ def motion_residual(spec: mujoco.MjSpec, pieces, scale: np.ndarray):
     return sysid.build_residual_fn(models_sequences=[one], modify_residual=residual, resample_true=False)
 
 
-def fitted(residual, free: sysid.ParameterDict, limit: float) -> tuple[list[tuple[float, float]], str]:
-    """(seconds since the start, sum of squares) at every single point tried, and how it ended."""
-    begun, path = time.perf_counter(), []
+def fitted(
+    residual, free: sysid.ParameterDict, limit: float, clock=time.perf_counter
+) -> tuple[list[tuple[float, float]], str]:
+    """(seconds since the start, sum of squares) at every single point tried, and how it ended; `free` gets the best point."""
+    begun, path, points = clock(), [], []
 
     def watched(x, params, **options):
-        if time.perf_counter() - begun > limit:
+        if clock() - begun > limit:
             raise TimeOut
         result = residual(x, params, **options)
         if np.ndim(x) == 2:
@@ -127,11 +159,18 @@ def fitted(residual, free: sysid.ParameterDict, limit: float) -> tuple[list[tupl
             columns = [part.reshape(len(part), np.shape(x)[1], -1) for part in result[0]]
             result = ([part.transpose(2, 0, 1).reshape(-1, np.shape(x)[1]) for part in columns], *result[1:])
         if np.ndim(x) == 1 or np.shape(x)[1] == 1:
-            path.append((time.perf_counter() - begun, float(sum(np.sum(part**2) for part in result[0]))))
+            path.append((clock() - begun, float(sum(np.sum(part**2) for part in result[0]))))
+            points.append(np.ravel(x).copy())
         return result
 
+    def end(words: str) -> tuple[list[tuple[float, float]], str]:
+        free.update_from_vector(points[int(np.argmin([loss for _, loss in path]))])
+        return path, words
+
     try:
-        sysid.optimize(free, watched, optimizer="mujoco", verbose=False, **{"max_iters": 200})
+        # Its printed progress would be among the rows of a table.
+        with contextlib.redirect_stdout(sys.stderr):
+            sysid.optimize(free, watched, optimizer="mujoco", verbose=False, **{"max_iters": 200})
     except TimeOut:
-        return path, f"not finished in {limit:.0f} s"
-    return path, f"finished after {time.perf_counter() - begun:.1f} s"
+        return end(f"not finished in {limit:.0f} s")
+    return end(f"finished after {clock() - begun:.1f} s")

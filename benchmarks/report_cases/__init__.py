@@ -14,7 +14,7 @@ from benchmarks.report_cases.test_set import andrews, car_axis
 from jaxdyn.forces.elements import Drive
 from jaxdyn.model import robots
 from jaxdyn.reports import references as closed_forms
-from jaxdyn.reports.case import Case
+from jaxdyn.reports.programs import Case
 from jaxdyn.systems.scene import Scene
 
 _I5 = "Intel i5-4570, date not stated"

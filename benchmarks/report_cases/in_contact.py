@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks.report_cases.builders import scene_builder
 from jaxdyn.reports import references
-from jaxdyn.reports.case import Case
+from jaxdyn.reports.programs import Case
 
 
 def in_contact() -> tuple[Case, ...]:

@@ -7,7 +7,7 @@ from benchmarks.report_cases import references
 from benchmarks.report_cases.builders import scene_builder
 from benchmarks.report_cases.test_set import ANDREWS_ORDER, andrews_bodies
 from jaxdyn.reports import references as closed_forms
-from jaxdyn.reports.case import Case, Reference
+from jaxdyn.reports.programs import Case, Reference
 
 
 def _andrews_bodies(start) -> Reference:

@@ -1,18 +1,19 @@
-"""Shared parts of the commands: options of the model, vectors on the command line, output files."""
+"""Shared parts of the commands: options of the model and of Dask clusters, vectors on the command line, output files."""
 
 import argparse
 import contextlib
 import os
 import pathlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
-from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.formats import find_description, load
+from jaxdyn.io import LoadedScene, formats, urdf_inertia_report
+from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import inertia
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.description import short as short
@@ -20,8 +21,7 @@ from jaxdyn.model.description import table as table
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures import plot
 from jaxdyn.reports.plotting import BLUE, bands, new_figure
-from jaxdyn.simulation.export import signals, times
-from jaxdyn.simulation.solution import Solution
+from jaxdyn.simulation.solution import Solution, signals, times
 from jaxdyn.systems.system import SceneLike
 
 FILE = "a URDF, xacro, MJCF or SDF file, or a name of robot_descriptions such as go2_description"
@@ -71,30 +71,54 @@ def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> 
     )
 
 
-def load_model(path: str, args: argparse.Namespace) -> Model:
+def load_model(path: str, args: argparse.Namespace, missing_inertia: Any = None) -> Model:
     """Load the model of a URDF file under the options of `add_model_options`."""
     # A model alone imposes no couplings, so that joints which follow others are free by default.
-    model = load_urdf(
+    model = formats.load_model(
         path,
         floating_base=args.floating_base,
         lock=_lock(args),
         mimic=args.mimic or "ignore",
         gravity=GRAVITY if args.gravity is None else tuple(args.gravity),
+        missing_inertia=missing_inertia,
         arguments=xacro_arguments(args),
     )
     return _movable(model, path)
+
+
+def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[str]]:
+    """Load a model, and the names of the massless moving links that were given a small ball.
+
+    Links are changed only if the file cannot be loaded as it is. The ball makes the mass matrix positive definite and changes the
+    motion of the other links little; the fit replaces it.
+
+    **Raises:** ValueError as `load_model`, where balls do not help.
+    """
+    try:
+        return load_model(path, args), []
+    except ValueError:
+        file = XmlFile(path, "URDF", xacro_arguments(args))
+        masses = [parse_number(mass.get("value", "0")) for mass in file.root.iterfind("link/inertial/mass")]
+        # A hundredth of the heaviest link, of 1 kg if no link has a mass.
+        ball = inertia.sphere(1e-2 * (max(masses, default=0.0) or 1.0), 0.05)
+        model = load_model(path, args, ball)
+        report = urdf_inertia_report(path, arguments=xacro_arguments(args))
+        massless = [name for name, problem in report if problem.startswith("massless") and name in model.body_names]
+        return model, massless
 
 
 def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathlib.Path]:
     """Load the scene of a file or a named robot under the options of `add_model_options`; return it with its file."""
     file = as_path(path, "file")
     if not file.suffix and not file.exists():
-        file = find_description(path)
+        file = formats.find_description(path)
     if args.floating_base and args.fixed_base:
         raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")
     # Neither option: None, for the default of the format.
     floating = False if args.fixed_base else True if args.floating_base else None
-    scene = load(file, floating_base=floating, lock=_lock(args), mimic=args.mimic, arguments=xacro_arguments(args))
+    scene = formats.load(
+        file, floating_base=floating, lock=_lock(args), mimic=args.mimic, arguments=xacro_arguments(args)
+    )
     _movable(scene.system, path)
     if args.gravity is not None:
         scene = eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity)))
@@ -247,3 +271,43 @@ class Stopwatch:
 
     def __str__(self):
         return f"{time.perf_counter() - self._start:.1f} s"
+
+
+# --- options `--client` and `--workers`: Dask clusters that compute for a command ---
+
+
+def add_cluster_options(parser: Any) -> None:
+    """Add the options to a parser or to a group of one."""
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument(
+        "--client", metavar="ADDRESS", help="address of a Dask scheduler whose workers compute, as tcp://host:8786"
+    )
+    place.add_argument("--workers", type=whole, metavar="N", help="number of local Dask worker processes to start")
+
+
+@contextlib.contextmanager
+def connect(args: argparse.Namespace) -> Iterator[Any]:
+    """Connect to the scheduler at --client, or to a local cluster of --workers processes; None with neither.
+
+    **Raises:** ValueError where no scheduler answers, for fewer than one worker, and where Dask is not installed.
+    """
+    check_least(args, workers=1)
+    if args.client is None and args.workers is None:
+        yield None
+        return
+    try:
+        # Imported on use: Dask is an extra.
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ValueError(f"--client and --workers need {error.name}: pip install 'jaxdyn[scale]'") from error
+    with contextlib.ExitStack() as stack:
+        place = args.client
+        if place is None:
+            # Any free port for the dashboard, whose address is printed.
+            local = LocalCluster(n_workers=args.workers, threads_per_worker=2, processes=True, dashboard_address=":0")
+            place = stack.enter_context(local)
+        try:
+            client = stack.enter_context(Client(place))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"--client is {args.client}, where no scheduler of Dask answers: {error}") from error
+        yield client

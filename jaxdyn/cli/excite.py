@@ -21,7 +21,7 @@ from jaxdyn.cli.common import (
 from jaxdyn.cli.identify_mechanism import load_mechanism
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import TERMS
-from jaxdyn.identify.workflows.excitation_search import OBJECTIVES
+from jaxdyn.identify.excitation_search import OBJECTIVES
 from jaxdyn.io import write_log
 from jaxdyn.model.configuration import columns_of
 from jaxdyn.simulation.solution import Solution

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from jaxdyn import __version__, identify
-from jaxdyn.cli.clusters import add_cluster_options, connect
 from jaxdyn.cli.common import (
     Stopwatch,
+    add_cluster_options,
     add_model_options,
     check_least,
+    connect,
+    load_for_repair,
     load_model,
     output_path,
     real,
@@ -22,14 +24,12 @@ from jaxdyn.cli.identify_logs import filter_log, log_cutoff, log_names, log_path
 from jaxdyn.cli.identify_mechanism import load_mechanism, run_mechanism
 from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, resolve_options
 from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
-from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.linear_fit import base_terms
+from jaxdyn.identify.raw_logs import check_log_content, check_rest, vibration
 from jaxdyn.identify.regression import log_regressor
-from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
-from jaxdyn.identify.workflows.raw_logs import vibration
 from jaxdyn.io import save_urdf
 from jaxdyn.io.urdf_write import write_text
 from jaxdyn.model.configuration import columns_of

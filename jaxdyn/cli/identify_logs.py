@@ -9,7 +9,7 @@ import numpy as np
 from jaxdyn import identify
 from jaxdyn.cli.common import number
 from jaxdyn.identify import Log
-from jaxdyn.identify.workflows.log_repair import repair_log
+from jaxdyn.identify.log_repair import repair_log
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.tree import Model
 

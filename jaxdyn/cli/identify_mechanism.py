@@ -11,7 +11,7 @@ from jaxdyn.cli.identify_logs import filter_log, log_cutoff, log_names, log_path
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.constraints.loops import Loop
 from jaxdyn.identify import TERMS, Log
-from jaxdyn.identify.workflows.mechanism_fit import MechanismFit, fit_mechanism
+from jaxdyn.identify.applied_fits import MechanismFit, fit_mechanism
 from jaxdyn.io.loaded import LoadedScene
 from jaxdyn.io.urdf_write import write_text
 from jaxdyn.systems.scene import Scene

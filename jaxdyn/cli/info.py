@@ -64,17 +64,13 @@ def run(args: argparse.Namespace) -> None:
     model, is_urdf = scene.system, format_of(file) == "urdf"
     if out is not None and not is_urdf:
         raise ValueError(f"--repair {args.repair}: only URDF files can be repaired; change the inertias in {file}")
-    # Read once more for names and unused elements, which a model does not hold.
-    source = XmlFile(file, "robot", xacro_arguments(args))
-    body_problems = _of_the_file(inertia_report(model), source)
+    # Read once more for the names of the file, which a model does not hold.
+    body_problems = _of_the_file(inertia_report(model), XmlFile(file, "robot", xacro_arguments(args)))
     print(describe(scene, args.file))
     print(constraint_lines(scene))
     links = urdf_inertia_report(file, arguments=xacro_arguments(args)) if is_urdf else None
     print(_problems(links, body_problems))
-    if is_urdf:
-        print(_elements_without_effect(source))
-    if scene.not_taken or not is_urdf:
-        print("\n".join(["\nUnsupported elements of the file:", *(scene.not_taken or ["none"])]))
+    print("\n".join(["\nUnsupported elements of the file:", *(scene.not_taken or ["none"])]))
     if out is not None:
         repaired = repair_inertias(model)
         save_urdf(repaired, out)
@@ -270,20 +266,3 @@ def _problems(links: list[tuple[str, str]] | None, bodies: list[tuple[str, str]]
 
 def _name_list(names: list[str]) -> str:
     return f": {', '.join(names)}" if names else ""
-
-
-def _elements_without_effect(file: XmlFile) -> str:
-    """Count the elements of the file that the model does not represent."""
-    counts: collections.Counter[str] = collections.Counter()
-    for element in file.root:
-        if element.tag == "gazebo" and (
-            element.find("joint") is not None or element.find("plugin/mimicJoint") is not None
-        ):
-            continue  # loops and couplings are represented
-        if element.tag not in ("link", "joint"):
-            counts[element.tag] += 1
-            continue
-        used = {"inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic"}
-        counts.update(part.tag for part in element if part.tag not in used)
-    names = ", ".join(f"{count} <{tag}>" for tag, count in sorted(counts.items()))
-    return f"\nUnused elements of the file: {names or 'none'}."

@@ -40,10 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--integrator",
-        "--way",
         nargs="+",
         metavar="I",
-        help="method:solver, e.g. projected:Dopri8, instead of the usual ones (--way: its former name)",
+        help="method:solver, e.g. projected:Dopri8, instead of the usual ones",
     )
     parser.add_argument("--rounds", type=whole, default=20, metavar="N", help="timings of each run (default: 20)")
 

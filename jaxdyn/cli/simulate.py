@@ -2,6 +2,7 @@
 
 import argparse
 import pathlib
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,7 +28,7 @@ from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify import SampledTorque
-from jaxdyn.identify.workflows.excitation import FourierTorque, random_torque
+from jaxdyn.identify.excitation import FourierTorque, random_torque
 from jaxdyn.io import LoadedScene
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.configuration import integrate
@@ -35,6 +36,7 @@ from jaxdyn.model.tree import Model
 from jaxdyn.pictures import save_html, shapes, view
 from jaxdyn.simulation.events import events_of
 from jaxdyn.simulation.methods import Projected
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import Solution, simulate
 from jaxdyn.systems.scene import Scene
 
@@ -172,11 +174,10 @@ def run(args: argparse.Namespace) -> int:
     scene = Scene(model, loaded.constraints, _forces(loaded, args))
     starts, speeds = _starts(scene, q0, v0, args)
     # A fixed step has no tolerance, so only one of the two is passed.
-    steps = {"stepsize": args.dt} if args.dt is not None else {"rtol": args.rtol, "atol": args.rtol}
+    rtol = args.rtol if args.dt is None else None
+    steps: dict[str, Any] = {"stepsize": Steps(args.dt, rtol=rtol, atol=rtol, max_steps=args.max_steps)}
     if args.rank_tol is not None:
         steps["method"] = Projected(rank_tol=args.rank_tol)
-    if args.max_steps is not None:
-        steps["max_steps"] = args.max_steps
 
     watch = Stopwatch()
     carry = model if args.torque.startswith("gravity") else None

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import scale, scenes
-from jaxdyn.cli.clusters import add_cluster_options, connect
-from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
-from jaxdyn.io import load_urdf
+from jaxdyn.cli.common import Stopwatch, add_cluster_options, check_least, check_memory, connect, whole
+from jaxdyn.io import load_model
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.configuration import integrate, neutral
 from jaxdyn.simulation.events import events_of
+from jaxdyn.simulation.options import as_output
 from jaxdyn.simulation.run import simulate
 
 HELP = "simulate a study of many rollouts into a Zarr store; resumable"
@@ -84,7 +84,7 @@ _KEYS: dict[str, tuple[type, ...]] = {
     "reductions": (dict,),
 }
 # Options of `jd.simulate` that a file can set, and of `jd.scale.run`.
-_OPTIONS = {"batch_size", *inspect.signature(simulate).parameters}
+_OPTIONS = {"batch_size", "rtol", "atol", "max_steps", *inspect.signature(simulate).parameters}
 # The study sets these itself, or a file cannot express them.
 _OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "events", "throw"}
 # Events by words (`events_of`).
@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
     draw = make_draw(parameters)
     scene, states = _scene(_require(study, path, "scene"), path, tuple(parameters))
     ts = np.linspace(0.0, duration, points)
-    watch = Stopwatch()
+    options, watch = _options(study), Stopwatch()
     with connect(args) as client:
         result = scale.run(
             scene,
@@ -145,14 +145,14 @@ def run(args: argparse.Namespace) -> int:
             samples=given,
             seed=study.get("seed", 0) if args.seed is None else args.seed,
             out=out,
-            outputs=tuple(study.get("outputs", ())),
+            outputs=tuple(map(as_output, study.get("outputs", ()))),
             rows=study.get("rows", True),
             reductions={name: _reduction(name, one) for name, one in study.get("reductions", {}).items()},
             units={name: one["units"] for name, one in parameters.items() if isinstance(one, dict) and "units" in one},
-            client=client,
-            chunk=args.chunk,
-            progress=not args.quiet,
-            **_options(study),
+            resources=scale.Resources(
+                client, batch_size=options.pop("batch_size", None), chunk=args.chunk, progress=not args.quiet
+            ),
+            **options,
         )
     print(f"{result}\nin {watch}, compilation included.")
     return int(not result.success)
@@ -260,7 +260,7 @@ def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[
             raise ValueError(f"{file} has no function {' and '.join(missing)} of the parameters")
         return module.scene, module.states
     if file.suffix == ".urdf":
-        model = load_urdf(file)
+        model = load_model(file)
         if unknown := set(parameters) - {"q0", "v0"}:
             raise ValueError(f"{path}: parameters of a .urdf are q0 and v0, not {', '.join(sorted(unknown))}")
 

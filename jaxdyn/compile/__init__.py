@@ -12,10 +12,8 @@ compiles programs around kernels ahead of time, and `jaxdyn.exports`, which writ
 modules.
 """
 
-from jaxdyn.compile.executables import entry_point as entry_point
-from jaxdyn.compile.executables import jit as jit
+from jaxdyn.compile.batch import sweep as sweep
 from jaxdyn.compile.first_calls import wait_for_code as wait_for_code
-from jaxdyn.compile.flags import mark_invalid as mark_invalid
 from jaxdyn.compile.jacobi import gram_eigenvectors as gram_eigenvectors
 from jaxdyn.compile.jacobi import inverse as inverse
 from jaxdyn.compile.jacobi import pseudo_inverse_by_pivots as pseudo_inverse_by_pivots
@@ -23,20 +21,22 @@ from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_
 from jaxdyn.compile.kernels import Evaluation as Evaluation
 from jaxdyn.compile.kernels import evaluate as evaluate
 from jaxdyn.compile.kernels import kernel as kernel
+from jaxdyn.compile.kernels import run_trial as _run_trial  # noqa: F401 (it registers itself)
 from jaxdyn.compile.kernels import variant as variant
 from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.mode import is_standalone as is_standalone
 from jaxdyn.compile.mode import values_of_rules as values_of_rules
+from jaxdyn.compile.pivots import cholesky_factor as cholesky_factor
 from jaxdyn.compile.pivots import eliminate as eliminate
 from jaxdyn.compile.pivots import eliminate_rows as eliminate_rows
 from jaxdyn.compile.pivots import solver_of as solver_of
+from jaxdyn.compile.pivots import triangular_solution as triangular_solution
 from jaxdyn.compile.rules import batch_alike as batch_alike
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivatives
+from jaxdyn.compile.rules import mark_invalid as mark_invalid
 from jaxdyn.compile.rules import reverse_only as reverse_only
 from jaxdyn.compile.rules import value_and_jvp as value_and_jvp
-from jaxdyn.compile.sweeps import sweep as sweep
-from jaxdyn.compile.trial import run_trial as _run_trial  # noqa: F401 (it registers itself)
-from jaxdyn.compile.triangular import cholesky_factor as cholesky_factor
-from jaxdyn.compile.triangular import triangular_solution as triangular_solution
+from jaxdyn.compile.stored import entry_point as entry_point
+from jaxdyn.compile.stored import jit as jit

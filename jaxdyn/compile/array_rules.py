@@ -14,9 +14,8 @@ import numpy as np
 
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.look_ups import scatter_at, select_among
 from jaxdyn.compile.program import NotNumbers, Number, as_kind, as_objects, dtype_of, is_number, kind_or_refuse, objects
-from jaxdyn.compile.rearrange import scatter_places
+from jaxdyn.compile.rearrange import scatter_at, scatter_places, select_among
 from jaxdyn.compile.rolled import MIN_ITERATIONS, roll
 
 # Operations of the columns of a solution, up to which they are written out: what goes in and out of a loop is copied.

@@ -13,12 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import array_rules, jax_adapter, look_ups, mode, rolled
+from jaxdyn.compile import array_rules, jax_adapter, mode, rearrange, rolled
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
-from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import replay
+from jaxdyn.compile.graph import Graph, replay
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,
@@ -149,7 +148,7 @@ class _Expansion:
             return rule(self, params, args, eqn)
         if name in AT_PLACES:
             if any(x.dtype.kind == "O" for x in args[_ARRAYS[name] :]):
-                return look_ups.at_place(AT_PLACES[name], self, params, args, eqn)
+                return rearrange.at_place(AT_PLACES[name], self, params, args, eqn)
             return AT_PLACES[name](params, args, eqn)
         out = eqn.outvars[0].aval
         known = all(x.dtype.kind != "O" for x in args)
@@ -313,6 +312,15 @@ class _Expansion:
             rows = as_objects(args[0]).reshape(-1, inner.inputs[0].size)
             results = [self.graph.call(inner, [row])[0].ravel() for row in rows]
             return [np.stack(results).reshape(*lead, -1)]
+        lead = max((x.shape[:-1] for x in args), key=len)
+        if not lead:
+            return self._one_call(inner, args)
+        # A batch, such as the columns of a Jacobian: inputs that all of it share have no leading axes.
+        rows = [self._one_call(inner, [x[i] if x.ndim > 1 else x for x in args]) for i in np.ndindex(lead)]
+        return [np.stack(column).reshape(*lead, -1) for column in zip(*rows, strict=True)]
+
+    def _one_call(self, inner: Program, args) -> list:
+        """The results of a kernel within this one, for one sample."""
         shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
         self.has_rules |= inner.derivative is not None
         fast = inner if inner.fast is None else inner.fast
@@ -427,19 +435,19 @@ _OTHER: dict[str, Callable] = {
     "dot_general": array_rules.dot_general,
     "scatter-add": array_rules.scatter,
     "scatter": array_rules.scatter,
-    "gather": look_ups.gather_at,
-    "argmax": look_ups.extreme_place,
-    "argmin": look_ups.extreme_place,
+    "gather": rearrange.gather_at,
+    "argmax": rearrange.extreme_place,
+    "argmin": rearrange.extreme_place,
     "call_hi_primitive": _Expansion._high,
     "polynomial": array_rules.polynomial,
-    **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin"), look_ups.cumulative),
+    **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin"), rearrange.cumulative),
     "scan": rolled.scan,
     "jaxdyn_sweep": rolled.sweep,
     "while": rolled.while_loop,
     "cond": _Expansion._cond,
     "custom_linear_solve": _Expansion._linear_solve,
     "cholesky": array_rules.cholesky,
-    "lu": look_ups.lu,
+    "lu": rearrange.lu,
     "triangular_solve": array_rules.triangular_solve,
     "jaxdyn_kernel": _Expansion._kernel,
     "jaxdyn_invalid": _Expansion._invalid,

@@ -6,7 +6,6 @@ thread of the process, after the first call. Python's collector of cycles stays 
 
 import atexit
 import contextlib
-import contextvars
 import heapq
 import itertools
 import logging
@@ -154,63 +153,11 @@ jax.monitoring.register_event_duration_secs_listener(_first_call.add_compilation
 phase, optimise_later, wait_for_code = _first_call.phase, _first_call.optimise_later, _first_call.finish
 
 
-# --- code that is made during the call ---
-#
-# LLVM releases Python's lock while it compiles: a thread works on while Python traces and XLA compiles. It belongs to one call
-# from outside, which waits for it before it returns, so that no thread outlives the call. Under the user's own `jax.jit` there is
-# no such call: a thread ends with its task there, for which Python waits at the end of the process.
-
-# A context variable, not a global: two threads of the user may trace at the same time.
-_worker: contextvars.ContextVar["_Worker | None"] = contextvars.ContextVar("jaxdyn_worker", default=None)
-
-
-class _Worker:
-    """A thread that starts when there is something to do."""
-
-    def __init__(self):
-        self.executor: ThreadPoolExecutor | None = None
-
-    def submit(self, make: Callable) -> None:
-        if self.executor is None:
-            self.executor = ThreadPoolExecutor(1, thread_name_prefix="jaxdyn compiler")
-        self.executor.submit(make)
-
-    def end(self) -> None:
-        if self.executor is not None:
-            # Tasks that have not begun are dropped: a kernel without code is compiled by its first call.
-            self.executor.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def worker(is_wanted: bool = True) -> Iterator[None]:
-    """Context in which kernels are called as soon as they are compiled: a thread makes their code, and ends with the context.
-
-    Not `is_wanted`: what is traced is hardly ever called, as what singular samples need.
-    """
-    mine = _Worker() if is_wanted else None
-    token = _worker.set(mine)
-    try:
-        yield
-    finally:
-        _worker.reset(token)
-        if mine is not None:
-            mine.end()
-
-
-def is_active() -> bool:
-    """Decide whether kernels that are traced now are called as soon as XLA has compiled the program."""
-    return _worker.get() is not None
-
-
 def make_later(make: Callable) -> None:
-    """Call `make()` in the thread of the context, or in one of its own.
+    """Call `make()` in a thread of its own: LLVM releases Python's lock while it compiles.
 
     An error here is dropped: the first call of the kernel compiles it once more, and raises the error there.
     """
-    current = _worker.get()
-    if current is not None:
-        current.submit(make)
-        return
     alone = ThreadPoolExecutor(1, thread_name_prefix="jaxdyn compiler")
     alone.submit(make)
     alone.shutdown(wait=False)

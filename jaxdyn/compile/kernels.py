@@ -4,6 +4,7 @@ A call traces the function once, and calls its program through the primitive (se
 what a call means: the kernel, its fallback, or, inside another kernel, the function itself.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -14,9 +15,9 @@ import numpy as np
 
 from jaxdyn.compile import jax_adapter, mode
 from jaxdyn.compile.derive import without_unread
-from jaxdyn.compile.flags import has_marks
 from jaxdyn.compile.known import is_known, partition, partition_tracers
 from jaxdyn.compile.primitive import kernel_p, target
+from jaxdyn.compile.rules import has_marks
 from jaxdyn.compile.trace import function_of_leaves, inline_call, name_of, program_of, trace_program
 
 
@@ -84,16 +85,7 @@ def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -
         return None
     if mode.current() == "plain":
         return None
-    try:
-        results = _bind(function, static, tree, args, fallback, **how)
-    except Exception as error:
-        # On a version of JAX that the tests have seen, an error is the function's own or a fault of ours. On another one it
-        # may be that JAX has changed. The function's own errors are raised once more, before anything is forgiven.
-        if jax_adapter.is_version_known():
-            raise
-        values = (function if fallback is None else fallback)(*static, tree, *args)
-        jax_adapter.forgive(error)
-        return values
+    results = _bind(function, static, tree, args, fallback, **how)
     if isinstance(results, str):
         if fallback is None:
             mode.say_without_kernel(name_of(function), results)
@@ -165,11 +157,8 @@ class Evaluation:
                 self.found[key] = self._find(structure, leaves)
             if (found := self.found[key]) is not None:
                 call, places, results = found
-                try:
+                with contextlib.suppress(target.Unsupported):
                     return jax.tree.unflatten(results, call([leaves[i] for i in places]))
-                except Exception as error:
-                    if not isinstance(error, target.Unsupported) and not jax_adapter.forgive(error):
-                        raise
         with jax.ensure_compile_time_eval():
             return jax.tree.map(np.asarray, self.function(*self.static, self.tree, *map(jnp.asarray, args)))
 
@@ -207,3 +196,45 @@ def variant(inside: Callable, *, marks: bool = False) -> Any:
         return call
 
     return decorate
+
+
+# --- a kernel through all rules of its primitive, against JAX: what an unknown version of JAX has to pass before the first on---
+#
+# Rules are called by JAX in the midst of its transformations, where an error could no longer be made good.
+
+
+def _sample(known, x, y):
+    del known
+    return x * jnp.sin(y), jnp.sum(x / (2 + y * y))
+
+
+def _kernel(x, y):
+    leaves, expanded = program_of(_sample, (), None, (x, y))
+    program, structure = expanded
+    return jax.tree.unflatten(structure, call_program(program, leaves))
+
+
+def _transforms(function, x, y) -> list:
+    def slope(x, y):
+        return jax.grad(lambda x, y: jnp.sum(function(x, y)[0]) + function(x, y)[1], (0, 1))(x, y)
+
+    # Values, a jvp, a batch with a shared argument and a batched gradient: every rule of the primitive is called once.
+    batches = [jax.jit(jax.vmap(f, (0, None)))(x, y) for f in (function, slope)]
+    return [jax.jit(function)(x[0], y), jax.jvp(function, (x[0], y), (y, y)), *batches]
+
+
+def run_trial() -> None:
+    """**Raises:** whatever goes wrong, and ArithmeticError where numbers differ."""
+    if target is None:
+        return
+    # Before anything is traced: XLA may refuse the handler.
+    target.register()
+    x, y = jnp.arange(12.0).reshape(4, 3), jnp.arange(3.0)
+    computed, wanted = (_transforms(f, x, y) for f in (_kernel, functools.partial(_sample, None)))
+    for mine, theirs in zip(jax.tree.leaves(computed), jax.tree.leaves(wanted), strict=True):
+        # Loose, as the trial looks for other rules, not for rounding, and may run in float32.
+        if mine.shape != theirs.shape or not np.allclose(mine, theirs, 1e-4, 1e-4):
+            raise ArithmeticError("a kernel gives other numbers than JAX")
+
+
+jax_adapter.try_first(run_trial)

@@ -11,11 +11,20 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxdyn.compile import careful_text, memory
-from jaxdyn.compile.body import Body, has_loop, has_zeros, is_zero, write_call
+from jaxdyn.compile import careful
+from jaxdyn.compile.body import (
+    Body,
+    allocation,
+    bytes_of,
+    copy_bytes,
+    fill_zeros,
+    has_loop,
+    has_zeros,
+    is_zero,
+    write_call,
+)
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
-from jaxdyn.compile.memory import allocation, bytes_of
 from jaxdyn.compile.program import COMPARISONS, Array, Constant, Program, dtype_of, kind_of
 
 # Operations from which on a program is a listing, and those of one that calls loops: arithmetic on the arrays that loops take and
@@ -69,7 +78,7 @@ class Listing(Body):
     def allocations(self) -> list[str]:
         """Memory for all numbers."""
         lines = [allocation("%numbers", max(64, self.memory.size))]
-        return [*lines, *careful_text.allocation(self.careful)]
+        return [*lines, *careful.allocation(self.careful)]
 
     def compute(self) -> None:
         """Write the table and the lines that run it."""
@@ -140,7 +149,7 @@ class Listing(Body):
             e = self.e
             self.data = f"@constants{len(e.declared)}"
             e.declared[self.data] = _data(self.data, data)
-            memory.copy(e, self.data, self._pointer(0), len(data))
+            copy_bytes(e, self.data, self._pointer(0), len(data))
 
     def _constants_of(self, entries, arrays: Sequence[Array]) -> None:
         kinds = itertools.chain(*(itertools.repeat(kind_of(x.dtype), x.size) for x in arrays))
@@ -166,7 +175,7 @@ class Listing(Body):
             first = self.memory.take(size)
             step = array.dtype.itemsize * e.width
             if pointer is not None:
-                memory.copy(e, pointer, self._pointer(first), array.size * step)
+                copy_bytes(e, pointer, self._pointer(first), array.size * step)
             for entry, kind, i in read:
                 self.at[i] = first + entry * step
                 if pointer is None:
@@ -279,7 +288,7 @@ class Listing(Body):
     def _write_call(self, called, flag: str, places: Sequence[int]) -> None:
         pointers = [self._pointer(x) for x in places]
         if isinstance(called, Careful):
-            self.careful = max(self.careful, careful_text.write_call(self.e, called, flag, pointers))
+            self.careful = max(self.careful, careful.write_call(self.e, called, flag, pointers))
         else:
             write_call(self.e, called, pointers)
 
@@ -298,7 +307,7 @@ class Listing(Body):
         is_empty = has_zeros(entries)
         if is_empty:
             self._run()
-            memory.zero(e, self._pointer(place), array.size * step)
+            fill_zeros(e, self._pointer(place), array.size * step)
         for k, x in enumerate(entries):
             if not (is_empty and is_zero(x)):
                 self._copy(kind, self._operand(x, kind), place + k * step)

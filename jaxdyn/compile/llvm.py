@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxdyn.compile.program import COMPARISONS, FLOATS
-from jaxdyn.compile.trigonometry import COSINE, HALF_PI, MAX_ANGLE, SINE
 
 _TYPES = {"f8": "double", "f4": "float", "b1": "i1", "i1": "i8", "i4": "i32", "i8": "i64"}  # i1: a bool in memory
 _BYTES = {"f8": 8, "f4": 4, "b1": 1, "i1": 1, "i4": 4, "i8": 8}
@@ -24,6 +23,39 @@ _LIBRARY = {
     "exp2": "exp2", "expm1": "expm1", "log": "log", "log1p": "log1p", "cbrt": "cbrt", "pow": "pow", "atan2": "atan2",
     "rem": "fmod",
 }  # fmt: skip
+
+# pi/2 in three parts: k times each of the first two is exact for the integers k up to 2^23 (2^13 in float32), so that the
+# reduced argument is right to rounding for |x| up to MAX_ANGLE (Cody & Waite 1980, ch. 8). Beyond, k x has more digits than
+# the parts leave room for; from 1e17 on what is left of x is no angle any more, and polynomials of it have no bound.
+HALF_PI = {
+    "f8": (1.570796325802803, 9.920935791635221e-10, 5.170182981794105e-19),
+    "f4": (1.5703125, 4.837512969970703e-04, 7.549789954891882e-08),
+}
+MAX_ANGLE = {"f8": 1.3e7, "f4": 1.2e4}
+# (sin x - x)/x^3 and (cos x - 1 + x^2/2)/x^4 as polynomials in x^2 on |x| <= pi/4: Chebyshev fits made with 200 bits (mpmath
+# chebyfit), off by 2e-17 and 1e-18 in float64, 2e-8 and 2e-9 in float32.
+SINE = {
+    "f8": (
+        -0.16666666666666666,
+        0.008333333333330936,
+        -0.00019841269836740527,
+        2.7557316093196066e-06,
+        -2.5051129895962807e-08,
+        1.5917988944318716e-10,
+    ),
+    "f4": (-0.16666664656310706, 0.008332747104372895, -0.000195876390357926),
+}
+COSINE = {
+    "f8": (
+        0.041666666666666664,
+        -0.0013888888888887389,
+        2.48015872987544e-05,
+        -2.7557317265876615e-07,
+        2.087614504910828e-09,
+        -1.1382544623404291e-11,
+    ),
+    "f4": (0.04166666465348729, -0.0013888301867270142, 2.4547689709382208e-05),
+}
 
 # Comparisons of stores grow with the square of this number and fences with its inverse; 8, 32 and 128 compile equally fast.
 STORES_BETWEEN_FENCES = 32

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import mode
+from jaxdyn.compile.body import MAX_STACK_BYTES
 from jaxdyn.compile.code import varying_first
-from jaxdyn.compile.memory import MAX_STACK_BYTES
 from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.program import Array
 

@@ -6,7 +6,6 @@ transpose of that is the kernel of the transposed program. So derivatives of any
 of `vmap`, are kernels. On a CPU the primitive is lowered to a call of native code, elsewhere to operations of JAX.
 """
 
-import contextlib
 import functools
 import math
 from collections.abc import Sequence
@@ -15,13 +14,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import derive, first_calls, jax_adapter, mode
+from jaxdyn.compile import derive, jax_adapter, mode
 from jaxdyn.compile.careful import guard
-from jaxdyn.compile.flags import mark_invalid
+from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.operations import as_operations, by_jax
-from jaxdyn.compile.program import NotNumbers, Program, TooLong
-from jaxdyn.compile.shared import split_program
+from jaxdyn.compile.program import Array, Constant, NotNumbers, Program, Renumbering, TooLong, dtype_of
+from jaxdyn.compile.rules import mark_invalid
+from jaxdyn.compile.stored import key_within, load_or_make
 from jaxdyn.compile.trace import tangent_program
 
 try:
@@ -46,13 +46,6 @@ def _implement(*args, program, rows):
 
 
 def _result_types(*avals, program, rows):
-    is_one = not any(len(x.shape) > 1 for x in avals)
-    if is_one and first_calls.is_active() and not mode.is_expanding():
-        assert target is not None
-        # JAX asks for the types first, long before it lowers: LLVM works while Python traces on. An error is raised, with
-        # its message, where the kernel is lowered.
-        with contextlib.suppress(target.Unsupported):
-            target.make_ahead(target.kernel(program, target.width_of(program, 1), [False] * len(avals)))
     return _results_of(avals, program.outputs)
 
 
@@ -105,10 +98,7 @@ def _tangent_or_none(program, moving: tuple[bool, ...]) -> Program | None:
         if program.fallback is None:
             raise
         mode.say_without_kernel(f"the derivative of {program.name}", str(reason))
-    except Exception as error:
-        if program.fallback is None or not jax_adapter.forgive(error):
-            raise
-    return None
+        return None
 
 
 def _jvp_by_jax(program, moving, primals, steps) -> list:
@@ -259,24 +249,10 @@ def _partition_attributes(avals: Sequence, results: Sequence) -> dict | None:
 # --- lowering ---
 
 
-def _lower_on_cpu(ctx, *operands, program, rows):
-    try:
-        return _lower_to_call(ctx, *operands, program=program, rows=rows)
-    except Exception as error:
-        if not jax_adapter.forgive(error):
-            raise
-        return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
-
-
 def _lower_on_gpu(ctx, *operands, program, rows):
     if mode.current() != "native":  # until it has run on a device
         return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
-    try:
-        return _lower_to_call(ctx, *operands, program=program, rows=rows, on_gpu=True)
-    except Exception as error:
-        if not jax_adapter.forgive(error):
-            raise
-        return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
+    return _lower_to_call(ctx, *operands, program=program, rows=rows, on_gpu=True)
 
 
 def _lower_elsewhere(*args, program, rows):
@@ -367,9 +343,98 @@ kernel_p = define_primitive(
     multiple_results=True,
     implement=_implement,
     lower=_lower_elsewhere,
-    lower_on_cpu=_lower_on_cpu,
+    lower_on_cpu=_lower_to_call,
     lower_on_gpu=_lower_on_gpu,
     batch=_batch,
     jvp=_jvp,
     transpose=_transpose,
 )
+
+
+# --- operations whose results all samples of a batch share, such as those on the model alone: they run once per call ---
+#
+# A program is split in two. The first runs once and computes the shared numbers; the second runs for each sample and reads those
+# that it needs. For forward dynamics of a given robot the first program has a third of the operations.
+
+
+def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
+    """Split a program into one of the uniform inputs and one of all inputs and the results of the first.
+
+    `uniform` marks the inputs that are equal for all samples. None where so few operations are shared that a second call
+    would cost more.
+    """
+    if not isinstance(program, Program) or not any(uniform):
+        return None
+    key = ("split", tuple(uniform))
+    if key not in program.derived:
+        # A program or two, or none.
+        make = functools.partial(_split, program, uniform)
+        both, _ = load_or_make(key_within(program, *key), lambda: (make() or (), None))
+        program.derived[key] = tuple(both) or None
+    return program.derived[key]
+
+
+def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
+    is_shared: list[bool] = []
+    for op, _, args in program.operations:
+        if op == "input":
+            is_shared.append(uniform[args[0]])
+        else:
+            # Subprograms are not split: their calls stay in the program of the batch.
+            is_shared.append(
+                op not in ("call", "call_where", "part") and all(is_shared[x] for x in args if type(x) is not Constant)
+            )
+    saved = sum(
+        shared and op not in ("input", "neg") for shared, (op, _, _) in zip(is_shared, program.operations, strict=True)
+    )
+    # Below this a second call costs more than the batch saves; for one sample nothing is saved at all.
+    if saved < MIN_SHARED_OPERATIONS:
+        return None
+    # One array for each kind of number, not one per number: the runtime handler checks every argument of a kernel.
+    passed = _interface(program, is_shared)
+    kinds = sorted({program.operations[i][1] for i in passed})
+    by_kind = [[i for i in passed if program.operations[i][1] == kind] for kind in kinds]
+    arrays = [Array((len(entries),), dtype_of(kind)) for kind, entries in zip(kinds, by_kind, strict=True)]
+
+    places = [i for i, same in enumerate(uniform) if same]
+    # Operations keep their order in both programs and get new indices.
+    first = Renumbering()
+    for i, (op, kind, args) in enumerate(program.operations):
+        if is_shared[i]:
+            args = (places.index(args[0]), args[1]) if op == "input" else first.args(args)
+            first.add(i, (op, kind, args))
+    once = Program(
+        [program.inputs[i] for i in places],
+        arrays,
+        first.operations,
+        [tuple(first.index[i] for i in entries) for entries in by_kind],
+        name=f"{program.name}, shared by all samples",
+    )
+
+    # The second program takes all inputs, also those that only the first one reads, so that argument positions do not change.
+    count, rest = len(program.inputs), Renumbering()
+    for place, (kind, entries) in enumerate(zip(kinds, by_kind, strict=True), count):
+        for k, i in enumerate(entries):
+            rest.add(i, ("input", kind, (place, k)))
+    for i, (op, kind, args) in enumerate(program.operations):
+        if is_shared[i]:
+            continue
+        rest.add(i, (op, kind, args if op == "input" else rest.args(args)))
+    each = Program(
+        [*program.inputs, *arrays],
+        program.outputs,
+        rest.operations,
+        [rest.args(row) for row in program.results],
+        program.subprograms,
+        name=program.name,
+    )
+    return once, each
+
+
+def _interface(program: Program, is_shared: Sequence[bool]) -> list[int]:
+    """Shared operations that the second program reads or returns, in the order in which it reads them."""
+    read = [args for i, (op, _, args) in enumerate(program.operations) if not is_shared[i] and op != "input"]
+    numbers: dict[int, None] = {}
+    for args in (*read, *program.results):
+        numbers |= {x: None for x in args if type(x) is not Constant and is_shared[x]}
+    return list(numbers)

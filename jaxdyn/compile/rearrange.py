@@ -1,11 +1,15 @@
 """Operations that only move entries of arrays, known or not: slices, transposes, gathers and scatters at known places."""
 
-from collections.abc import Callable
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.compile.program import NotNumbers, as_objects
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.program import NotNumbers, as_kind, as_objects, is_number, kind_or_refuse, objects
 
 
 def _slice(params, args, out):
@@ -183,3 +187,225 @@ def scatter_places(eqn, operand, indices, updates) -> list:
 AT_PLACES: dict[str, Callable] = {
     "dynamic_slice": dynamic_slice, "dynamic_update_slice": dynamic_update_slice,
 }  # fmt: skip
+
+
+# --- rules for places that are not known while tracing ---
+#
+# They are entries of tables, sums into them, indices of extremes, and exchanges of rows.
+#
+# A scalar program has no addresses. An entry at an unknown place is a chain of selections over all places that it can have, which
+# pays for tables of some hundred entries. Operands are as in `array_rules`.
+
+
+# A look-up among more places is left to JAX: each one costs a comparison and a selection in every call.
+MOST_PLACES = 256
+
+
+def at_place(rule, expansion, params, args, eqn):
+    """A slice, or an update of one, at places of which some are not known."""
+    count = 1 if rule is dynamic_slice else 2
+    arrays, starts = args[:count], [as_objects(x).item() for x in args[count:]]
+    sizes = params["slice_sizes"] if rule is dynamic_slice else args[1].shape
+    g = expansion.graph
+    # Like XLA, which moves a part that is beyond the array to its edge.
+    ends = [n - m for n, m in zip(args[0].shape, sizes, strict=True)]
+    chosen = [_clip(g, x, end) for x, end in zip(starts, ends, strict=True)]
+    results = None
+    for place in _places(chosen, [range(end + 1) for end in ends], eqn):
+        (here,) = rule(params, [*arrays, *map(np.asarray, place)], eqn)
+        results = here if results is None else _select(expansion, _is_at(g, chosen, place), here, results, eqn)
+    return [results]
+
+
+def gather_at(expansion, params, args, eqn):
+    """Entries at places of which some are not known."""
+    operand, indices = args
+    if indices.dtype.kind != "O":
+        return gather(params, args, eqn)
+    g, d = expansion.graph, params["dimension_numbers"]
+    out = eqn.outvars[0].aval
+    ends = [operand.shape[i] - params["slice_sizes"][i] for i in d.start_index_map]
+    fills = "fill" in str(params["mode"]).lower()
+    if fills and out.dtype.kind != "f":
+        raise NotNumbers("integers at a place that is not known")
+    others = [i for i in range(len(out.shape)) if i not in d.offset_dims]
+    starts = indices if fills else _clip_all(g, indices, ends)
+    results = objects([math.nan] * math.prod(out.shape), out.shape) if fills else None
+    for place, flags in _rounds(g, starts, [range(end + 1) for end in ends], eqn):
+        (here,) = gather(params, [operand, place], eqn)
+        flags = _along(flags, others, out.shape)
+        results = here if results is None else _select(expansion, flags, here, results, eqn)
+    return [results]
+
+
+def scatter_at(expansion, params, args, eqn):
+    """Write or add updates at indices of which some are not known; updates out of bounds are dropped, as in JAX."""
+    operand, indices, updates = args
+    g, d = expansion.graph, params["dimension_numbers"]
+    adds, kind = eqn.primitive.name != "scatter", kind_or_refuse(eqn.outvars[0].aval.dtype)
+    window = [i for i in range(operand.ndim) if i not in (*d.inserted_window_dims, *d.operand_batching_dims)]
+    sizes = {i: updates.shape[of_update] for i, of_update in zip(window, d.update_window_dims, strict=True)}
+    ends = [operand.shape[i] - sizes.get(i, 1) for i in d.scatter_dims_to_operand_dims]
+    others = [i for i in range(updates.ndim) if i not in d.update_window_dims]
+    starts = _clip_all(g, indices, ends) if "clip" in str(params["mode"]).lower() else indices
+    entries, values = as_objects(operand).ravel().tolist(), as_objects(updates).ravel().tolist()
+    for place, flags in _rounds(g, starts, [range(end + 1) for end in ends], eqn):
+        flags = np.broadcast_to(_along(flags, others, updates.shape), updates.shape).ravel().tolist()
+        places = scatter_places(eqn, operand, place, updates)
+        for flag, i, value in zip(flags, places, values, strict=True):
+            if i is not None and flag is not False:
+                entries[i] = g.select(flag, entries[i], g.add(entries[i], value) if adds else value, kind)
+    return [objects(entries, operand.shape)]
+
+
+def extreme_place(expansion, params, args, eqn):
+    """Indices of the largest or smallest entries, the first of equal ones and of NaN, as in JAX."""
+    g, (axis,) = expansion.graph, params["axes"]
+    out = eqn.outvars[0].aval
+    kind, is_largest = kind_or_refuse(out.dtype), eqn.primitive.name == "argmax"
+    dtype = eqn.invars[0].aval.dtype
+    rows = np.moveaxis(as_objects(args[0]), axis, 0).reshape(args[0].shape[axis], -1)
+
+    def is_better(x, best):
+        if dtype.kind == "b":
+            return g.both(x, g.invert(best)) if is_largest else g.both(g.invert(x), best)
+        better = g.compare("gt" if is_largest else "lt", x, best)
+        if dtype.kind != "f":
+            return better
+        is_first_nan = g.both(g.compare("ne", x, x), g.compare("eq", best, best))
+        return g.either(better, is_first_nan)
+
+    found = []
+    for column in rows.T.tolist():
+        best, place = column[0], as_kind(0, kind)
+        for i, x in enumerate(column[1:], 1):
+            better = is_better(x, best)
+            best = g.select(better, best, x, kind_or_refuse(dtype))
+            place = g.select(better, place, as_kind(i, kind), kind)
+        found.append(place)
+    return [objects(found, out.shape)]
+
+
+def cumulative(expansion, params, args, eqn):
+    """Partial sums, products or extremes, from either end."""
+    # Sequential, because every partial result is one. XLA sums in a tree, whose rounding differs.
+    x = np.moveaxis(as_objects(args[0]), params["axis"], 0)
+    order = range(x.shape[0])
+    order = reversed(order) if params["reverse"] else order
+    extreme = {"cummax": "reduce_max", "cummin": "reduce_min"}.get(eqn.primitive.name)
+    if extreme is None:
+        step = expansion.elementwise["add" if eqn.primitive.name == "cumsum" else "mul"]
+    else:
+        step = np.frompyfunc(lambda a, b: expansion.graph.extreme(extreme, [a, b]), 2, 1)
+    results, total = np.empty(x.shape, object), None
+    for i in order:
+        total = x[i] if total is None else step(total, x[i])
+        results[i] = total
+    return [np.moveaxis(results, 0, params["axis"])]
+
+
+def lu(expansion, params, args, eqn):
+    """Factors of matrices with their rows exchanged for the largest pivots, the exchanges, and the permutations."""
+    matrix, pivot, permutation = (x.aval for x in eqn.outvars)
+    kinds = kind_or_refuse(matrix.dtype), kind_or_refuse(pivot.dtype)
+    given = as_objects(args[0]).reshape(-1, *args[0].shape[-2:])
+    factored = [_lu_of_one(expansion.graph, x.tolist(), *kinds) for x in given]
+    return [
+        objects([y for one in factored for y in one[i]], aval.shape)
+        for i, aval in enumerate((matrix, pivot, permutation))
+    ]
+
+
+def _lu_of_one(g: Graph, rows: list[list], kind: str, index: str) -> tuple[list, list, list]:
+    pivots = []
+    # The permutation is one more column, which is exchanged with the others.
+    order = [as_kind(i, index) for i in range(len(rows))]
+    for k in range(min(len(rows), len(rows[0]))):
+        largest, place = g.function("abs", rows[k][k]), as_kind(k, index)
+        for i in range(k + 1, len(rows)):
+            size = g.function("abs", rows[i][k])
+            is_larger = g.compare("gt", size, largest)
+            largest = g.select(is_larger, largest, size, kind)
+            place = g.select(is_larger, place, as_kind(i, index), index)
+        pivots.append(place)
+        for i in range(k + 1, len(rows)):
+            flag = g.compare("eq", place, as_kind(i, index))
+            upper, lower = rows[k], rows[i]
+            rows[k] = [g.select(flag, x, y, kind) for x, y in zip(upper, lower, strict=True)]
+            rows[i] = [g.select(flag, y, x, kind) for x, y in zip(upper, lower, strict=True)]
+            order[k], order[i] = g.select(flag, order[k], order[i], index), g.select(flag, order[i], order[k], index)
+        inverse = g.div(1.0, rows[k][k])
+        for i in range(k + 1, len(rows)):
+            factor = g.mul(rows[i][k], inverse)
+            changed = [g.sub(x, g.mul(factor, y)) for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True)]
+            rows[i] = [*rows[i][:k], factor, *changed]
+    return [x for row in rows for x in row], pivots, order
+
+
+def select_among(expansion, which, cases, out):
+    """Entries of several cases, by a number that is not known."""
+    g, kind = expansion.graph, kind_or_refuse(out.dtype)
+    which = np.broadcast_to(as_objects(which), out.shape).ravel().tolist()
+    columns = [np.broadcast_to(as_objects(x), out.shape).ravel().tolist() for x in cases]
+    chosen = columns[-1]
+    for i in reversed(range(len(cases) - 1)):
+        flags = [g.compare("eq", x, as_kind(i, x.kind)) if is_number(x) else x == i for x in which]
+        chosen = [g.select(flag, b, a, kind) for flag, a, b in zip(flags, columns[i], chosen, strict=True)]
+    return [objects(chosen, out.shape)]
+
+
+# --- chains of places ---
+
+
+def _places(starts: Sequence, ranges: Sequence[range], eqn) -> Iterator[tuple[int, ...]]:
+    """All places that starts can have, of which some are known."""
+    choices = [values if is_number(x) else (int(x),) for x, values in zip(starts, ranges, strict=True)]
+    if (count := math.prod(map(len, choices))) > MOST_PLACES:
+        raise NotNumbers(f"{eqn.primitive.name} at one of {count} places that is not known")
+    return itertools.product(*choices)
+
+
+def _rounds(g: Graph, starts: np.ndarray, ranges: Sequence[range], eqn) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Known indices, the same for all rows of `starts`, and flags of the rows that have them."""
+    rows = as_objects(starts).reshape(-1, starts.shape[-1])
+    choices = []
+    for column, values in zip(rows.T.tolist(), ranges, strict=True):
+        known = sorted({int(x) for x in column if not is_number(x)})
+        choices.append(known if len(known) and all(not is_number(x) for x in column) else values)
+    if (count := math.prod(map(len, choices))) > MOST_PLACES:
+        raise NotNumbers(f"{eqn.primitive.name} at one of {count} places that is not known")
+    for place in itertools.product(*choices):
+        flags = objects([_is_at(g, row, place) for row in rows.tolist()], starts.shape[:-1])
+        yield np.broadcast_to(np.asarray(place, np.int64), starts.shape), flags
+
+
+def _is_at(g: Graph, starts: Sequence, place: Sequence[int]):
+    flags = [
+        g.compare("eq", x, as_kind(i, x.kind)) if is_number(x) else int(x) == i
+        for x, i in zip(starts, place, strict=True)
+    ]
+    return functools.reduce(g.both, flags, True)
+
+
+def _clip(g: Graph, x, end: int):
+    return g.clamp(as_kind(0, x.kind), x, as_kind(end, x.kind)) if is_number(x) else min(max(int(x), 0), end)
+
+
+def _clip_all(g: Graph, indices, ends: Sequence[int]) -> np.ndarray:
+    rows = as_objects(indices).reshape(-1, len(ends)).tolist()
+    return objects([_clip(g, x, end) for row in rows for x, end in zip(row, ends, strict=True)], indices.shape)
+
+
+def _along(flags: np.ndarray, dims: Sequence[int], shape: Sequence[int]) -> np.ndarray:
+    """Flags with the given dimensions of a shape, to be broadcast to it."""
+    order = [1] * len(shape)
+    for dim, size in zip(dims, flags.shape, strict=True):
+        order[dim] = size
+    return flags.reshape(order)
+
+
+def _select(expansion, flags, here, otherwise, eqn) -> np.ndarray:
+    kind, shape = kind_or_refuse(eqn.outvars[0].aval.dtype), eqn.outvars[0].aval.shape
+    columns = (np.broadcast_to(as_objects(x), shape).ravel().tolist() for x in (np.asarray(flags), here, otherwise))
+    chosen = [expansion.graph.select(flag, b, a, kind) for flag, a, b in zip(*columns, strict=True)]
+    return objects(chosen, shape)

@@ -77,7 +77,7 @@ def _roll(expansion, inner, arrays, eqn, length: int, inward: bool, parents, mos
 
 
 def sweep(expansion, params, args, eqn):
-    """A sweep over a tree (see `sweeps`)."""
+    """A sweep over a tree (see `batch.sweep`)."""
     (before, count), parents, inward = params["counts"], params["parents"], params["inward"]
     consts, start, rows, inner = args[:before], args[before : before + count], args[before + count :], params["call"]
     # Whoever asks for a sweep has decided that a loop is faster. Without unknown numbers there is nothing to run.

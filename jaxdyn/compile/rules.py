@@ -1,5 +1,6 @@
-"""Functions whose derivatives are given by another computation than their values."""
+"""Functions whose derivatives are given by another computation than their values, and marks of samples without a value."""
 
+import weakref
 from collections.abc import Callable
 from typing import Any, NoReturn
 
@@ -9,9 +10,38 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdyn.compile import mode
-from jaxdyn.compile.flags import is_float
-from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_zero
+from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, function_of, is_zero, zero_tangent
 from jaxdyn.compile.known import is_concrete, partition_tracers
+
+
+def _define_flagged(name: str, **lowering) -> Any:
+    """A primitive of flags and an array of their shape, which is linear in the array and acts entry by entry."""
+
+    def batch(args, axes):
+        size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+        full = [
+            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(args, axes, strict=True)
+        ]
+        return primitive.bind(*full), 0
+
+    def jvp(primals, tangents):
+        flag, x = primals
+        step = tangents[1]
+        return primitive.bind(flag, x), step if is_zero(step) else primitive.bind(flag, step)
+
+    def transpose(cotangent, flag, x):
+        return [None, cotangent if is_zero(cotangent) else primitive.bind(flag, cotangent)]
+
+    primitive = define_primitive(
+        name,
+        lambda flag, x: ShapedArray(x.shape, x.dtype),
+        batch=batch,
+        jvp=jvp,
+        transpose=transpose,
+        **lowering,
+    )
+    return primitive
 
 
 def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
@@ -138,34 +168,11 @@ def _nan_where(failed, x):
     return _nan_where_p.bind(jnp.broadcast_to(failed, x.shape), x)
 
 
-def _batch(args, axes):
-    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
-    full = [
-        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(args, axes, strict=True)
-    ]
-    return _nan_where_p.bind(*full), 0
-
-
-def _jvp(primals, tangents):
-    failed, x = primals
-    step = tangents[1]
-    return _nan_where_p.bind(failed, x), step if is_zero(step) else _nan_where_p.bind(failed, step)
-
-
-def _transpose(cotangent, failed, x):
-    return [None, cotangent if is_zero(cotangent) else _nan_where_p.bind(failed, cotangent)]
-
-
-# A primitive, as no sum of products that JAX could transpose is zero for zeros and NaN for all other numbers.
-_nan_where_p = define_primitive(
+# No sum of products that JAX could transpose is zero for zeros and NaN for all other numbers.
+_nan_where_p = _define_flagged(
     "jaxdyn_nan_where",
-    lambda failed, x: ShapedArray(x.shape, x.dtype),
     implement=jax.jit(lambda failed, x: jnp.where(failed & (x != 0), jnp.nan, jnp.zeros_like(x))),
     lower=lambda failed, x: jnp.where(failed & (x != 0), jnp.nan, jnp.zeros_like(x)),
-    batch=_batch,
-    jvp=_jvp,
-    transpose=_transpose,
 )
 
 
@@ -216,4 +223,84 @@ _tangent_p = define_primitive(
     batch=lambda arrays, axes, message: _refuse(message=message),
     jvp=_tangent_jvp,
     transpose=lambda cotangent, x, message: [cotangent],
+)
+
+
+# --- samples that a kernel cannot compute: numbers that a function marks as not valid while it is traced ---
+#
+# A kernel has no branches. Where a fast formula fails for some samples, such as a Cholesky factor of rows that depend on each
+# other, the function says so by `mark_invalid(flag, x)`, which is NaN where the flag is set. The program reports which samples
+# are valid, and native code computes the others by the fallback (see `careful`). A program without marks reports nothing.
+
+
+def mark_invalid(flag: jax.Array, x: jax.Array) -> jax.Array:
+    """Mark a float array as not valid where the flag () is set; returns it with NaN there.
+
+    Outside of kernels nothing is marked: x is returned as it is.
+    """
+    if not mode.is_expanding():
+        return x
+    return invalid_p.bind(jnp.broadcast_to(flag, x.shape), x)
+
+
+def is_float(x) -> bool:
+    """Decide whether an array is of floating-point numbers, which can be marked and differentiated."""
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def mark_floats(flag: jax.Array, tree):
+    """`mark_invalid` the float arrays of a pytree; others stay as they are."""
+    return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, tree)
+
+
+_marked: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # jaxprs that were looked through
+
+
+def has_marks(jaxpr) -> bool:
+    """Decide whether a jaxpr marks numbers as not valid, also within functions that it calls."""
+    if jaxpr not in _marked:
+        _marked[jaxpr] = any(map(_is_marking, jaxpr.eqns))
+    return _marked[jaxpr]
+
+
+def _is_marking(eqn) -> bool:
+    if eqn.primitive.name == "jaxdyn_invalid" or getattr(eqn.params.get("program"), "careful", None) is not None:
+        return True
+    values = (x for value in eqn.params.values() for x in (value if isinstance(value, (tuple, list)) else (value,)))
+    inner = (getattr(x, "jaxpr", x) for x in values)
+    return any(hasattr(x, "eqns") and has_marks(x) for x in inner)
+
+
+# A primitive, not a `jnp.where` with NaN: an expansion collects the flags of all marks by its name. It has no lowering, as it is
+# bound while a program is traced, and nowhere else. Its tangent is NaN too: a derivative that was computed from the failed
+# formula must not look like a number.
+invalid_p = _define_flagged("jaxdyn_invalid")
+
+
+def _batch_guard(args, axes, *, call, again):
+    results = jax.vmap(function_of(call), axes)(*args)
+    return results, [0] * len(results)
+
+
+def _jvp_guard(primals, tangents, *, call, again):
+    places = [i for i, x in enumerate(tangents) if not is_zero(x)]
+
+    def at_values(*values):
+        point = list(primals)
+        for i, value in zip(places, values, strict=True):
+            point[i] = value
+        return function_of(call)(*point)
+
+    results, changes = jax.jvp(at_values, [primals[i] for i in places], [tangents[i] for i in places])
+    return results, [d if is_float(x) else zero_tangent(x) for x, d in zip(results, changes, strict=True)]
+
+
+# A function `call`, whose samples that are marked as not valid are computed by `again` (see `trace.Again`). Its derivatives and
+# batches are those of the function, whose marks reach the program around it then. It is bound while a program is traced.
+guarded_p = define_primitive(
+    "jaxdyn_guarded",
+    lambda *types, call, again: list(call.out_avals),
+    multiple_results=True,
+    batch=_batch_guard,
+    jvp=_jvp_guard,
 )

@@ -13,8 +13,7 @@ import numpy as np
 
 from jaxdyn.compile import first_calls, objects
 from jaxdyn.compile.body import symbol_of
-from jaxdyn.compile.careful import Careful, run_apart
-from jaxdyn.compile.careful_text import CAREFUL, identity_of, number_of
+from jaxdyn.compile.careful import CAREFUL, Careful, identity_of, number_of, run_apart
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, varying_first
 from jaxdyn.compile.first_calls import optimise_later, phase
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported

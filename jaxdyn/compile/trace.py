@@ -16,9 +16,9 @@ from jaxdyn.compile import jax_adapter, mode, stored
 from jaxdyn.compile.careful import Careful, digest_of, guard
 from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.first_calls import phase
-from jaxdyn.compile.flags import guarded_p, has_marks
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.program import Array, NotNumbers, Program, TooLong
+from jaxdyn.compile.rules import guarded_p, has_marks
 
 
 def program_of(

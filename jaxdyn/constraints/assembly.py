@@ -20,10 +20,16 @@ from jaxdyn.constraints.closing import follow_path, nearest_configuration, polis
 from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
-from jaxdyn.constraints.rank import LEAST_GAP, check_tolerance, clear_pivot, tolerance
-from jaxdyn.constraints.redundancy import keep_rows, opening_of_redundant, row_mask
+from jaxdyn.constraints.rank import CLOSED, LEAST_GAP, check_tolerance, clear_pivot, tolerance
+from jaxdyn.constraints.redundancy import (
+    coordinate_sizes,
+    keep_rows,
+    largest_ratio,
+    opening_of_redundant,
+    row_limits,
+    row_mask,
+)
 from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
-from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_mapping, check_state, zeros_if_none
 from jaxdyn.model.numbers import as_static, check_count
@@ -201,8 +207,7 @@ def check_search(steps: Any, guesses: Any, atol: Any) -> None:
 
 def closing_tolerance(dtype) -> float:
     """Part of the mechanism's length that counts as rounding of a converged residual."""
-    # 1e-11 in float64: some digits above eps for loops of many bodies, far below the gaps of files, which are 1e-8 or more.
-    return float(jnp.finfo(dtype).eps) ** 0.7
+    return float(jnp.finfo(dtype).eps) ** CLOSED
 
 
 def _from_elsewhere(assembly: Assembly, guesses: int, from_guess: Callable, scene: Scene, q) -> Assembly:
@@ -355,7 +360,7 @@ def _sizes(*parts):
     return jnp.stack([jnp.max(jnp.abs(part), initial=0.0) for part in parts])
 
 
-def open_constraints(scene: Scene, q, v, t: Any = 0.0, relative: float = 0.0) -> str:
+def open_constraints(scene: Scene, q, v, t: Numbers = 0.0, relative: float = 0.0) -> str:
     """Sentence on the constraints violated by more than `row_limits`, the worst first; for concrete states."""
     t = jnp.asarray(t, q.dtype)
     phi, psi, *limits = (np.asarray(x) for x in _residuals_and_limits(scene, q, v, t, relative))

@@ -7,7 +7,6 @@ residual w(q, v, t), linear in v up to a term without v, that is to be zero (non
     psi(q, v, t) = (d/dt phi, w) = A v - b,   A = dpsi/dv,   gamma = -(d/dt psi at a = 0) = -(Adot v) + bdot.
 """
 
-import warnings
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
@@ -34,23 +33,11 @@ from jaxdyn.model.arguments import (
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
-# Methods of constraints by their names up to version 0.1.
-_OLD_NAMES = {"slip": "velocity", "grouped_position": "group_positions", "grouped_motion": "group_rows"}
-
 
 class Constraint(eqx.Module):
     """Base of all constraints. `name` is used by errors and reports."""
 
     name: eqx.AbstractVar[str]
-
-    def __init_subclass__(cls, **options):
-        super().__init_subclass__(**options)
-        for old, new in _OLD_NAMES.items():
-            if old in cls.__dict__:
-                warnings.warn(
-                    f"{cls.__name__}.{old} is called `{new}` now; rename it", DeprecationWarning, stacklevel=2
-                )
-                setattr(cls, new, cls.__dict__[old])
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """Residual phi(q, t) (nh,) of the holonomic part, or None when there is none."""
@@ -252,7 +239,7 @@ def nonholonomic_rows(places: Sequence[Layout]) -> np.ndarray:
     return np.concatenate([np.arange(place.nonholonomic, place.end) for place in places] or [np.zeros(0, int)])
 
 
-def position_residual(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, " nh"]:
+def position_residual(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, " nh"]:
     """phi(q, t) of all holonomic parts, stacked in the scene's order; (0,) when there are none."""
     return _position_residual(scene, q, jnp.asarray(t, q.dtype))
 
@@ -264,7 +251,7 @@ def _position_residual(scene: Scene, q, t):
 
 
 def velocity_residual(
-    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0
+    scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
     """psi(q, v, t) = A v - b of all constraints, (nc,)."""
     return _velocity_residual(scene, q, v, jnp.asarray(t, q.dtype))
@@ -272,12 +259,8 @@ def velocity_residual(
 
 @kernel
 def _velocity_residual(scene: Scene, q, v, t):
-    values, rest, others = _split(scene, q, v, t)
-    if rest:
-        velocity = _by_functions(others, q, v, t)
-        for i, place in zip(rest, layout(others), strict=True):
-            values[i] = (velocity[place.start : place.end],)
-    return jnp.concatenate([parts[-1] for parts in values])
+    parts = _by_constraint(scene, q, v, t, lambda others: (_by_functions(others, q, v, t),))
+    return jnp.concatenate([part[-1] for part in parts])
 
 
 def _by_functions(scene: Scene, q, v, t):
@@ -291,23 +274,21 @@ def _by_functions(scene: Scene, q, v, t):
     return jnp.concatenate(parts)
 
 
-def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Rows:
+def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0) -> Rows:
     """A, gamma and A v - b of all constraints of the scene (see `Rows`)."""
     return _rows(scene, q, v, jnp.asarray(t, q.dtype))
 
 
 @kernel
 def _rows(scene: Scene, q, v, t) -> Rows:
-    blocks, rest, others = _split(scene, q, v, t)
-    if rest:
+    def of_functions(others):
         # With a = 0 the rate of psi along the motion is Adot v - bdot, so that gamma is its negative.
         motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
         velocity, rate = jax.jvp(lambda q, t: _by_functions(others, q, v, t), (q, t), motion)
-        A = _by_differentiation(others, q, t)
-        for i, place in zip(rest, layout(others), strict=True):
-            part = slice(place.start, place.end)
-            blocks[i] = A[part], -rate[part], velocity[part]
-    return Rows(*(jnp.concatenate(parts) for parts in zip(*blocks, strict=True)))
+        return _by_differentiation(others, q, t), -rate, velocity
+
+    parts = _by_constraint(scene, q, v, t, of_functions)
+    return Rows(*(jnp.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nc nv"]:
@@ -335,16 +316,13 @@ def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) 
 
 @kernel
 def _jacobian(scene: Scene, q, t):
-    blocks, rest, others = _split(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
-    if rest:
-        A = _by_differentiation(others, q, t)
-        for i, place in zip(rest, layout(others), strict=True):
-            blocks[i] = (A[place.start : place.end],)
-    return jnp.concatenate([parts[0] for parts in blocks])
+    at_rest = jnp.zeros((scene.nv,), q.dtype)
+    parts = _by_constraint(scene, q, at_rest, t, lambda others: (_by_differentiation(others, q, t),))
+    return jnp.concatenate([part[0] for part in parts])
 
 
-def _split(scene: Scene, q, v, t):
-    """A, gamma and velocity of the constraints in groups, indices of the others, and a scene of the others."""
+def _by_constraint(scene: Scene, q, v, t, of_functions: Callable) -> list[Any]:
+    """A, gamma and velocity of each constraint of a group; of all others their rows of `of_functions(a scene of these)`."""
     layout(scene)  # raises for entries that are no constraints, and for constraints that do not fit the system
     results: list[Any] = [None] * len(scene.constraints)
     for places in _groups(scene):
@@ -352,7 +330,12 @@ def _split(scene: Scene, q, v, t):
         for i, value in zip(places, members[0].group_rows(members, scene.system, q, v, t), strict=True):
             results[i] = value
     rest = [i for i, value in enumerate(results) if value is None]
-    return results, rest, Scene(scene.system, tuple(scene.constraints[i] for i in rest))
+    if rest:
+        others = Scene(scene.system, tuple(scene.constraints[i] for i in rest))
+        values = of_functions(others)
+        for i, place in zip(rest, layout(others), strict=True):
+            results[i] = tuple(x[place.start : place.end] for x in values)
+    return results
 
 
 def _by_differentiation(scene: Scene, q, t):

@@ -9,9 +9,8 @@ from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints import selection
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
 from jaxdyn.constraints.rank import LEAST_GAP, check_tolerance, has_clear_rank, pseudo_inverse, rank_of, tolerance
-from jaxdyn.constraints.redundancy import has_selection
+from jaxdyn.constraints.redundancy import coordinate_sizes, has_selection
 from jaxdyn.constraints.selection import UNCLEAR_RANK, independent_rows
-from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_scene

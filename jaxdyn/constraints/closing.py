@@ -21,8 +21,8 @@ from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.branches import passes_singular
 from jaxdyn.constraints.dynamics import correction, right_inverse, whiten_rows
-from jaxdyn.constraints.rank import eps_of, solve_square
-from jaxdyn.constraints.tolerances import coordinate_sizes
+from jaxdyn.constraints.rank import CONVERGED, NEAR, NEGLIGIBLE, REGULAR, RESIDUAL, eps_of, solve_square
+from jaxdyn.constraints.redundancy import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.configuration import difference
@@ -79,7 +79,7 @@ def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
     sizes, _ = coordinate_sizes(scene.system, guess.dtype)
     # Any direction that no symmetry of a mechanism shares: along a symmetry the push would keep the path at the obstacle.
     aside = jnp.asarray(np.cos(1.0 + 2.4 * np.arange(scene.nv)), guess.dtype)
-    done = eps_of(guess) ** 0.6
+    done = eps_of(guess) ** NEGLIGIBLE
 
     def improve(state):
         q, _, passed, A_before, B_before, count = state
@@ -116,9 +116,9 @@ def _linearize_rows(scene: Scene, guess, t, e):
 
 def _near(dtype) -> tuple[float, float]:
     """Step of Newton's method behind which it has converged, and one from which it converges, rad or lengths of the mechanism."""
-    # 1e-7 in float64: convergence is quadratic, so that what is left is rounding.
+    # Convergence is quadratic, so that what is left behind the first is rounding.
     eps = float(jnp.finfo(dtype).eps)
-    return eps**0.45, eps**0.3
+    return eps**CONVERGED, eps**NEAR
 
 
 class Slide(NamedTuple):
@@ -157,7 +157,7 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol, bounds=None) -> Sl
     converged, is_close = _near(guess.dtype)
     lengths = jnp.asarray(_SLIDE_LENGTHS, guess.dtype)
     nh = holonomic_rows(layout(scene)).size
-    limit = eps_of(guess) ** 0.4 * jnp.minimum(length, 1.0)
+    limit = eps_of(guess) ** REGULAR * jnp.minimum(length, 1.0)
 
     def residual(e):
         return position_residual(scene, displace(scene.system, guess, e), t)
@@ -209,7 +209,7 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol, bounds=None) -> Sl
         meets = (way <= longest) & (longest < 1)
         after = jnp.where(meets, jnp.where(step < 0, lower, upper), after)
         pull = held * -lam[nh:]
-        pull = jnp.where(pull > eps_of(e) ** 0.5 * jnp.max(jnp.abs(lam)), pull, jnp.zeros_like(pull))
+        pull = jnp.where(pull > eps_of(e) ** RESIDUAL * jnp.max(jnp.abs(lam)), pull, jnp.zeros_like(pull))
         released = is_minimum & (pull > 0) & (jnp.arange(e.size) == jnp.argmax(pull))
         released = released | (fresh & jnp.any(meets))
         fresh = jnp.where(jnp.any(meets), meets, fresh)

@@ -20,6 +20,8 @@ from jaxdyn.compile import batch, is_standalone, kernel, mark_invalid
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.rank import (
+    REFINED,
+    RESIDUAL,
     check_tolerance,
     eps_of,
     has_clear_rank,
@@ -232,7 +234,7 @@ def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, deficit, 
     residual = jnp.abs(deficit - matmul(Y.T, w))
     sizes = jnp.abs(gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(w * w)))
     # Rows that count as dependent may differ by the rank tolerance, and leave a residual of that size.
-    limit = max(eps_of(Y) ** 0.5, tolerance(rank_tol, Y))
+    limit = max(eps_of(Y) ** RESIDUAL, tolerance(rank_tol, Y))
     are_satisfied = jnp.all(residual <= limit * (sizes + jnp.max(sizes)))
     is_clear = has_clear_rank(Y.T, inverse.T, rank_tol, not isinstance(scene.system, Model))
     result = RESULTS.where(is_clear, RESULTS.successful, RESULTS.unclear_rank)
@@ -263,7 +265,7 @@ def _solve_with_refinement(factor, Y, right, quality, rank_tol):
     def refine(state):
         x, _ = state
         change = solve_cholesky(factor, right - matmul(Y.T, matmul(Y, x)))
-        return x + change, jnp.max(jnp.abs(change)) > eps_of(x) ** 0.75 * jnp.max(jnp.abs(x))
+        return x + change, jnp.max(jnp.abs(change)) > eps_of(x) ** REFINED * jnp.max(jnp.abs(x))
 
     # One step is enough for rows that are clearly independent. Near a singular position, where more are needed, a sample would
     # else leave the native loop, which takes as long as some hundred steps.

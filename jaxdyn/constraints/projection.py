@@ -1,34 +1,42 @@
-"""Projection of a state that has drifted slightly from its constraints back onto them, by the least change."""
+"""Projection of a state that has drifted slightly from its constraints back onto them, by the least change; derivatives."""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array
 
 from jaxdyn.compile import batch, implicit, kernel, mark_invalid, value_and_jvp, variant
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whiten_rows
-from jaxdyn.constraints.projection_derivative import ROUNDING_FACTOR, Corrections, closest_state
 from jaxdyn.constraints.rank import (
+    LeastSquares,
     least_pivot_of,
     least_refinable_pivot,
+    least_squares,
     pseudo_inverse,
     quality_of,
     regular_gram,
     tolerance,
 )
 from jaxdyn.constraints.redundancy import has_selection, row_mask, rows_of
+from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
+from jaxdyn.systems.mass_factor import MassFactor, cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
 # Steps with one factorisation, and factorisations. Steps of an integrator drift by 1e-8 or less, where two steps with one factor
 # reach rounding. More rounds are needed after long steps and near singular positions, where A turns quickly.
 _STEPS_A_ROUND, _MOST_ROUNDS = 2, 3
+# A residual is a sum of many terms that cancel. Below this many rounding errors of the largest entry it is only rounding.
+ROUNDING_FACTOR = 64
+# Each step multiplies the residual by the size of the correction times the curvature of the constraints. A fixed number, because
+# a scan of fixed length has derivatives of both modes and of any order.
+_DERIVATIVE_STEPS = 4
 
 
 def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
@@ -36,7 +44,7 @@ def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
 
     All steps share one factorisation: with B fixed, each step multiplies the residual by the size of the correction
     times the curvature of the constraint, 1e-8 -> 1e-16 after one. The steps end when the next one would be lost in rounding.
-    Derivatives are those of the equations that the result satisfies (`projection_derivative`). A projection that does not
+    Derivatives are those of the equations that the result satisfies (`closest_state`). A projection that does not
     reduce the residual is not applied.
     """
     return project_step(scene, q, v, t, (), rank_tol)[:2]
@@ -81,13 +89,9 @@ def _in_rounds(again: Callable, q, v, errors):
     return batch.repeat_while(lambda state: state[4], lambda state: tuple(again(*state[:2])), start, _MOST_ROUNDS)[:4]
 
 
-def _mark_in_kernel(flag, state):
-    return jax.tree.map(partial(mark_invalid, flag), state)
-
-
-@variant(_mark_in_kernel, marks=True)
+# Marks a state that was projected by rows which another choice may replace (`renew_rows`), in a kernel alone.
+@variant(lambda flag, state: jax.tree.map(partial(mark_invalid, flag), state), marks=True)
 def _mark(flag, state):
-    """Mark a state that was projected by rows which another choice may replace (`renew_rows`)."""
     return state
 
 
@@ -160,7 +164,9 @@ def _correct(scene: Scene, q, v, t, errors, every: Callable, some: Callable):
     holonomic = holonomic_rows(layout(scene))
     position_left, is_open = jnp.zeros((), q.dtype), jnp.asarray(False)
     if holonomic.size:
-        q, position_left, is_open = _close(scene, q, some, lambda place: position_residual(scene, place, t))
+        opening = lambda x, q=q: position_residual(scene, _place(scene, q, x), t)  # noqa: E731
+        x, position_left, is_open = _descend(jnp.zeros_like(v), jnp.max(jnp.abs(q)), some, opening)
+        q = _place(scene, q, x)
 
     # Velocities after positions: A at the corrected q. They are linear, so that a second step removes what the old factor left.
     none, size = jnp.zeros_like(v), jnp.max(jnp.abs(v))
@@ -195,17 +201,6 @@ def enlarge(error, by):
     return error + jnp.where(error < 0, -jnp.abs(by), jnp.abs(by))
 
 
-def _close(scene: Scene, q, step, residual):
-    """q on the holonomic constraints, an estimate of its distance from them, and whether another step would reduce it."""
-
-    def place(x):
-        return retract(scene.system, displace(scene.system, q, -x))
-
-    none, size = jnp.zeros((scene.nv,), q.dtype), jnp.max(jnp.abs(q))
-    x, away, more = _descend(none, size, step, lambda x: residual(place(x)))
-    return place(x), away, more
-
-
 def _descend(x, size, step, residual):
     """Add step(residual(x)) to the correction x, `_STEPS_A_ROUND` times at most, until that changes a state by rounding alone.
 
@@ -238,9 +233,10 @@ def _descend(x, size, step, residual):
 
 def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):
     """`project_step` as equations that its result satisfies, for its derivatives."""
+    q = retract(scene.system, q)
     state, errors = closest_state(scene, q, v, t, rank_tol), lax.stop_gradient(errors)
     if errors:
-        q = lax.stop_gradient(retract(scene.system, q))
+        q = lax.stop_gradient(q)
         on, A = Corrections.at(scene, q, t, rank_tol), constraint_jacobian(scene, q, t)
         of_place = partial(on.shortest, on.of_holonomic) if on.holonomic.size else None
         errors = _tangential_errors(
@@ -249,3 +245,156 @@ def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):
             (partial(on.shortest, on.every), partial(matmul, A), state.v_distance),
         )
     return state.q, state.v, lax.stop_gradient(errors)
+
+
+# Derivatives of the projection onto the constraints, by the implicit function theorem.
+#
+# The closest state to (q, v), in the metric M(q), is
+#
+#     q' = q - M^-1 A^T mu,   phi(q', t) = 0;        v' = v - M^-1 A^T nu,   A(q') v' = b(q', t),
+#
+# with M and A at q. The first A has the holonomic rows alone, the second has all rows. With x = M^-1 A^T mu and fixed mu, the
+# differential of x is M^-1 (dA^T mu - dM x), which needs no derivative of a factorisation. The differentials of mu and nu follow
+# from the condition that q' and v' stay on the constraints.
+
+
+class ClosestState(NamedTuple):
+    """State (q, v) on the constraints.
+
+    - `mu`, `nu`: the multipliers of the holonomic rows (for q) and of all rows (for v).
+    - `q_distance`, `v_distance`: remaining distances of q and v from the constraints.
+    - `q_applied`, `v_applied`: one where the correction was applied, else zero.
+    """
+
+    q: Array
+    v: Array
+    mu: Array
+    nu: Array
+    q_distance: Array
+    v_distance: Array
+    q_applied: Array
+    v_applied: Array
+
+
+class Corrections(NamedTuple):
+    """Least-squares steps that remove residuals, by Y = U^-1 A^T in the metric M = U U^T, for all rows and for holonomic ones."""
+
+    metric: MassFactor
+    every: LeastSquares
+    holonomic: Any  # indices of the holonomic rows
+    of_holonomic: LeastSquares
+
+    @classmethod
+    def at(cls, scene: Scene, q, t, rank_tol) -> "Corrections":
+        holonomic = holonomic_rows(layout(scene))
+        metric, Y = kernel(whiten_rows)(scene, q, t)
+        every = least_squares(Y, tolerance(rank_tol, Y))
+        # One factorisation suffices where all rows are holonomic, or none is.
+        if holonomic.size in (0, Y.shape[1]):
+            return cls(metric, every, holonomic, every)
+        return cls(metric, every, holonomic, least_squares(Y[:, holonomic], tolerance(rank_tol, Y)))
+
+    def by_forces(self, of: LeastSquares, multipliers):
+        """M^-1 A^T times multipliers."""
+        return self.metric.unwhiten(matmul(of.Y, multipliers))
+
+    def shortest(self, of: LeastSquares, residual):
+        """The shortest step that changes the rows by `residual`."""
+        return self.metric.unwhiten(of.shortest(residual))
+
+
+def closest_state(scene: Scene, q, v, t, rank_tol: float | None) -> ClosestState:
+    """The state on the constraints closest to a given one nearby, q on its manifold, with derivatives of any order.
+
+    A correction that leaves a larger residual is not applied, unless the residual is rounding.
+    """
+    # The tangent calls this function again, so that derivatives of derivatives are implicit too.
+    return implicit(scene, (q, v, t), partial(_solve, rank_tol), partial(_tangent, rank_tol))
+
+
+def _solve(rank_tol, scene: Scene, q, v, t) -> ClosestState:
+    corrections, none = Corrections.at(scene, q, t, rank_tol), jnp.zeros_like(v)
+
+    def remove(residual, of, size):
+        """The whitened correction that removes a residual, the distance left, and whether the correction is applied."""
+
+        def step(whitened, _):
+            return whitened + of.shortest(residual(corrections.metric.unwhiten(whitened))), None
+
+        whitened, _ = lax.scan(step, none, None, length=_DERIVATIVE_STEPS)
+        before, after = (residual(corrections.metric.unwhiten(x)) for x in (none, whitened))
+        away = jnp.max(jnp.abs(corrections.shortest(of, after)))
+        applied = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
+        applied = applied | (away <= ROUNDING_FACTOR * float(jnp.finfo(v.dtype).eps) * size)
+        left = jnp.where(applied, away, jnp.max(jnp.abs(corrections.shortest(of, before))))
+        return jnp.where(applied, whitened, none), left, applied.astype(v.dtype)
+
+    place, mu, q_distance, q_applied = q, jnp.zeros((0,), q.dtype), jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
+    if corrections.holonomic.size:
+        size = jnp.max(jnp.abs(q))
+        whitened, q_distance, q_applied = remove(
+            lambda x: kernel(_position)(scene, q, t, x), corrections.of_holonomic, size
+        )
+        place = kernel(_place)(scene, q, corrections.metric.unwhiten(whitened))
+        mu = corrections.of_holonomic.multipliers(whitened)
+    size = jnp.max(jnp.abs(v))
+    whitened, v_distance, v_applied = remove(
+        lambda y: kernel(_velocity)(scene, place, v, t, y), corrections.every, size
+    )
+    speed, nu = v - corrections.metric.unwhiten(whitened), corrections.every.multipliers(whitened)
+    return ClosestState(place, speed, mu, nu, q_distance, v_distance, q_applied, v_applied)
+
+
+def _place(scene: Scene, q, x):
+    return retract(scene.system, displace(scene.system, q, -x))
+
+
+def _position(scene: Scene, q, t, x):
+    """Residual of positions after a correction x."""
+    return position_residual(scene, displace(scene.system, q, -x), t)
+
+
+def _velocity(scene: Scene, q, v, t, y):
+    return velocity_residual(scene, q, v - y, t)
+
+
+def _forces(scene: Scene, q, t, mu, nu, x, y):
+    """Imbalance A^T mu - M x and A^T nu - M y of the corrections: zero in value, its derivative gives dA^T mu - dM x."""
+    A, M = constraint_jacobian(scene, q, t), mass_matrix(scene.system, q, t)
+    return matmul(A[holonomic_rows(layout(scene))].T, mu) - matmul(M, x), matmul(A.T, nu) - matmul(M, y)
+
+
+def _tangent(rank_tol, scene: Scene, q, v, t, steps) -> tuple[ClosestState, ClosestState]:
+    """The projection, and its tangent for `steps` in the leaves of the scene, q, v and t."""
+    state, corrections = closest_state(scene, q, v, t, rank_tol), Corrections.at(scene, q, t, rank_tol)
+    *of_scene, dq, dv, dt = steps
+    x = corrections.by_forces(corrections.of_holonomic, state.mu) if corrections.holonomic.size else jnp.zeros_like(v)
+    y = corrections.by_forces(corrections.every, state.nu)
+
+    # First the tangent for fixed multipliers; `tangent_of` adds that of the multipliers.
+    args = scene, q, t, state.mu, state.nu, x, y
+    change = value_and_jvp(kernel(_forces), args, [*of_scene, dq, dt, None, None, None, None])[1]
+    dx, dy = (jnp.zeros_like(v),) * 2 if change is None else map(corrections.metric.solve, change)
+
+    def tangent_of(residual, args, given, correction, of, moved):
+        """Tangents of a correction and of its multipliers, so that the residual stays zero; none if it was not applied."""
+
+        def step(whitened, _):
+            # The factor is that at q, as in the solution, while the derivative of the residual is taken at q': hence iterations.
+            change = value_and_jvp(residual, args, [*given, correction + corrections.metric.unwhiten(whitened)])[1]
+            return whitened + moved * of.shortest(change), None
+
+        whitened, _ = lax.scan(step, jnp.zeros_like(v), None, length=_DERIVATIVE_STEPS)
+        return correction + corrections.metric.unwhiten(whitened), of.multipliers(whitened)
+
+    mu, dplace = jnp.zeros_like(state.mu), dq
+    if corrections.holonomic.size:
+        args = scene, q, t, x
+        dx, mu = tangent_of(kernel(_position), args, [*of_scene, dq, dt], dx, corrections.of_holonomic, state.q_applied)
+        dplace = value_and_jvp(partial(kernel(_place), scene), (q, x), [dq, dx])[1]
+
+    args = scene, state.q, v, t, y
+    dy, nu = tangent_of(kernel(_velocity), args, [*of_scene, dplace, dv, dt], dy, corrections.every, state.v_applied)
+    none = jnp.zeros((), v.dtype)
+    dq, dv = (jnp.zeros_like(z) if d is None else d for z, d in ((q, dplace), (v, dv)))
+    return state, ClosestState(dq, dv - dy, mu, nu, none, none, none, none)

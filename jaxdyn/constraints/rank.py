@@ -1,7 +1,7 @@
 """Rank decisions, and pseudo-inverses of rows that may be dependent."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,17 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.numbers import as_static
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
 
+# Tolerances of constraints and of what is built on them, as powers of the rounding error eps of the dtype, with their values in
+# float64. In float32 the same powers leave the same share of the digits.
+RANK = 4 / 7  # 1.1e-9: above errors of projection, below the least singular values of mechanisms that move
+REGULAR = (
+    0.4  # 5.5e-7: least pivots, squares of singular values, of accurate factors; openings by which rows still hold
+)
+RESIDUAL = 0.5  # 1.5e-8: what equations leave of terms that cancel in them; Newton's steps behind which the next one is rounding
+NEGLIGIBLE = 0.6  # 4e-10: entries and steps that count as zero, below `RANK`
+CLOSED = 0.7  # 1.1e-11: residuals of closed loops of many bodies, far below the gaps of files, which are 1e-8 or more
+REFINED = 0.75  # 1.8e-12: four digits above eps, which a step of refinement gains; above the rounding of a Gram matrix
+CONVERGED, NEAR = 0.45, 0.3  # 9e-8, 2e-5: Newton's steps behind which it has converged, and from which it converges
 # Operations up to which normal equations are written out, with several samples in a vector: those of 12 x 8 take a third of the
 # time of loops, whose vectors are rows of one sample (`pseudo_inverse_by_pivots`). At 28 x 12 loops take 1.5 times as long in a
 # batch, two thirds as long alone, and compile in 0.1 s, what is written out in 0.8 s; from 28 x 16 on they are as fast.
@@ -43,9 +54,7 @@ def check_tolerance(rank_tol: float | None) -> float | None:
 
 def tolerance(rank_tol: float | None, like) -> float:
     """The rank tolerance as given, or the default for the dtype."""
-    # 1.1e-9 in float64, 1.1e-4 in float32: above the errors of projection, below the least singular values of mechanisms that
-    # move (`constrained_dynamics` has the figures).
-    return eps_of(like) ** (4 / 7) if (given := check_tolerance(rank_tol)) is None else given
+    return eps_of(like) ** RANK if (given := check_tolerance(rank_tol)) is None else given
 
 
 def eps_of(like) -> float:
@@ -57,13 +66,13 @@ def least_pivot(like, rank_tol: float | None) -> float:
     """Ratio of the pivots of A M^-1 A^T above which rounding cannot make the rows dependent, so that Cholesky is accurate."""
     # Pivots are squares of singular values, hence the square. The factor of 100 keeps the fast path away from the threshold
     # itself: samples near it are computed by the one method that applies the threshold.
-    return max(eps_of(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
+    return max(eps_of(like) ** REGULAR, (100 * tolerance(rank_tol, like)) ** 2)
 
 
 def least_refinable_pivot(like, rank_tol: float | None) -> float:
     """Ratio of the pivots above which each step of refinement gains digits, and rounding cannot make the rows dependent."""
     # A step multiplies the error by some 2^-52 over this ratio, the square of the condition number: by 1e-4.
-    return max(eps_of(like) ** 0.75, (100 * tolerance(rank_tol, like)) ** 2)
+    return max(eps_of(like) ** REFINED, (100 * tolerance(rank_tol, like)) ** 2)
 
 
 def clear_pivot(like) -> float:
@@ -136,7 +145,7 @@ def independent_columns(Y: Float[Array, "n m"], rank_tol: float) -> Columns:
     for j in range(m):
         rest = gram[:, j] - matmul(L, L[j])
         # Between the rounding of the Gram matrix and what counts as independent: what is near it is not clear.
-        is_kept = rest[j] > eps_of(Y) ** 0.75 * squares[j]
+        is_kept = rest[j] > eps_of(Y) ** REFINED * squares[j]
         column = jnp.where(is_kept, rest / jnp.sqrt(jnp.where(is_kept, rest[j], jnp.ones_like(rest[j]))), 0.0)
         L = L.at[j:, j].set(column[j:])
         kept.append(is_kept)
@@ -165,7 +174,7 @@ def solve_with_damping(A: Float[Array, "m n"], right: Float[Array, " m"]) -> Flo
     Rows may be zero. Where others depend on each other x is a compromise, not a NaN.
     """
     gram = regular_gram(A.T)
-    damping = eps_of(A) ** 0.75 * jnp.max(jnp.diagonal(gram))
+    damping = eps_of(A) ** REFINED * jnp.max(jnp.diagonal(gram))
     return matmul(A.T, solve_cholesky(cholesky(gram + damping * jnp.eye(A.shape[0], dtype=A.dtype)), right))
 
 
@@ -217,6 +226,37 @@ def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     dP = -matmul(matmul(P, dY), P)
     dP = dP + matmul(matmul(P, P.T), across) + matmul(along, matmul(P.T, P))
     return P, dP
+
+
+class LeastSquares(NamedTuple):
+    """Minimum-norm solutions w of Y^T w = r, and their coefficients in the columns of Y."""
+
+    Y: Array
+    factor: Any  # Cholesky factor of Y^T Y, in kernels; else None
+    inverse: Any  # pseudo-inverse of Y, elsewhere; else None
+
+    def shortest(self, right):
+        """The shortest w with Y^T w = right."""
+        if self.factor is None:
+            return matmul(self.inverse.T, right)
+        return matmul(self.Y, solve_cholesky(self.factor, right))
+
+    def multipliers(self, w):
+        """The smallest x with Y x = w, for w that is a sum of columns."""
+        if self.factor is None:
+            return matmul(self.inverse, w)
+        return solve_cholesky(self.factor, matmul(self.Y.T, w))
+
+
+def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
+    factor = cholesky(regular_gram(Y))
+    return LeastSquares(Y, mark_invalid(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
+
+
+@variant(_least_squares_in_kernel, marks=True)
+def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
+    """Factor a matrix: its pseudo-inverse; in a kernel its Cholesky factor, with dependent columns marked as invalid."""
+    return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
 
 
 def rank_of(A: Float[Array, "n m"], inverse: Float[Array, "m n"]) -> Float[Array, ""]:

@@ -31,6 +31,8 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.rank import (
     LEAST_GAP,
+    REGULAR,
+    RESIDUAL,
     clear_pivot,
     eps_of,
     least_pivot_of,
@@ -40,6 +42,7 @@ from jaxdyn.constraints.rank import (
 from jaxdyn.constraints.redundancy import (
     Selection,
     all_rows,
+    coordinate_sizes,
     has_selection,
     holds_rows,
     keep_rows,
@@ -47,7 +50,6 @@ from jaxdyn.constraints.redundancy import (
     largest_opening,
     rows_of,
 )
-from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state
@@ -175,7 +177,7 @@ def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Sele
     return every._replace(kept=mark_invalid(is_doubtful, jnp.asarray(every.kept)))
 
 
-def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selection:
+def select_rows(scene: Scene, q, t: Numbers, rank_tol: float | None = None) -> Selection:
     """The independent rows of a mechanism at a configuration on its constraints; a constant.
 
     With `rank_tol` rows count whose pivots are above it, at this configuration; without it as the module says. Concrete and
@@ -187,7 +189,7 @@ def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selec
 
 
 @variant(_select_in_kernel, marks=True)
-def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
+def _search_rows(scene: Scene, q, t: Numbers, rank_tol: float | None) -> Selection:
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
     if is_concrete(scene, q, t):
         place = np.asarray(q), np.asarray(t, q.dtype)
@@ -301,11 +303,7 @@ def _checked_rows(bare: Scene, q, t, old):
     return _check_kept_rows(bare, q, t, old, False)
 
 
-def _keep_state(old, new, project: Callable, state):
-    return state
-
-
-@variant(_keep_state, marks=True)
+@variant(lambda old, new, project, state: state, marks=True)
 def project_after_exchange(old, new, project: Callable, state: Any) -> Any:
     """project(state) where the rows `new` of the next step are not the `old` ones, else the state.
 
@@ -370,12 +368,12 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
 
     def goes_on(state):
         # Newton's steps square the distance: behind one of this size the next is lost in rounding. Also where it is not a number.
-        return (state[0] < _NEWTON_STEPS) & ~(state[2] < eps_of(q) ** 0.5)
+        return (state[0] < _NEWTON_STEPS) & ~(state[2] < eps_of(q) ** RESIDUAL)
 
     if held.size:
         place = retract(scene.system, lax.while_loop(goes_on, close, (0, place, jnp.ones((), q.dtype)))[1])
         # Off the constraints rows that repeat others look independent: where the search did not close them, q itself decides.
-        is_closed = largest_opening(scene, place, t, 1 - sure) <= eps_of(q) ** 0.4
+        is_closed = largest_opening(scene, place, t, 1 - sure) <= eps_of(q) ** REGULAR
         place = jnp.where(is_closed, place, q)
     B = kernel(unit_rows)(scene, place, t)
     # Twice the threshold at q: a row at the threshold has to have separated, not to have changed by rounding.
@@ -386,7 +384,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
     # Exact numbers: what is left of a row is its true direction, unless the row contradicts the others, or would leave no motion
     # at all. In both cases the difference is rounding in the numbers of the scene after all.
     every, least_rest, least_pivot = eliminate(B, least, kept)
-    met = largest_opening(scene, q, t, 1 - every * (1 - kept)) <= eps_of(q) ** 0.4
+    met = largest_opening(scene, q, t, 1 - every * (1 - kept)) <= eps_of(q) ** REGULAR
     counts = met & (jnp.sum(every) < scene.nv)
     return tuple(jnp.where(counts, x, y) for x, y in ((every, kept), (least_rest, rest), (least_pivot, pivot)))
 

@@ -27,7 +27,7 @@ from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, as_array, batch_hint, is_concrete
+from jaxdyn.model.arguments import Number, Numbers, as_array, as_shape, batch_hint, is_concrete
 from jaxdyn.model.numbers import as_float
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
@@ -108,11 +108,8 @@ def as_target(target: Target, name: str = "target") -> Callable:
 
 def target_value(target: Callable, t, shape: tuple, like) -> Array:
     """Value of a target at time t, in the dtype of `like`. **Raises:** ValueError for another shape."""
-    values = target(t)
-    if jnp.shape(values) != shape:
-        raise ValueError(f"target has shape {jnp.shape(values)}, expected {shape}{batch_hint(values, shape)}")
     # A float64 target would promote the law of a float32 state.
-    return jnp.asarray(values, like.dtype)
+    return jnp.asarray(as_shape(target(t), "target", like.dtype, shape))
 
 
 class ConfigurationError(Constraint):
@@ -210,21 +207,8 @@ def target_rows(system, error: Constraint, kp, kd, q, v, t) -> tuple[Float[Array
     return row.A, row.gamma - times(kd, row.velocity, "kd") - times(kp, position_residual(scene, q, t), "kp")
 
 
-def least_acceleration(system, q, t, A, wanted, start) -> Float[Array, " nv"]:
-    """Acceleration closest to `start` (nv,), in the metric M, with A a = wanted.
-
-    Inconsistent rows are met in the least-squares sense.
-    """
-    metric = mass_factor(mass_matrix(system, q, t))
-    # With M = L L^T, |a - start|_M is Euclidean in L^T a, where a pseudo-inverse gives the minimum.
-    Y = metric.whiten(A.T)
-    # Only what `start` lacks is corrected, so that the change of it is the least one.
-    missing = wanted - matmul(A, start)
-    return start + metric.unwhiten(matmul(pseudo_inverse(Y, tolerance(None, Y)).T, missing))
-
-
 def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"]:
-    """Acceleration closest to `start` (nv,), in the metric M, that meets pairs (A, wanted) by priority.
+    """Acceleration closest to `start` (nv,), in the metric M, with A a = wanted for pairs (A, wanted) by priority.
 
     Each is met, in the least-squares sense, in the null space of all before it, which it does not disturb.
     """
@@ -233,17 +217,21 @@ def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"
     free, a = jnp.eye(start.shape[0], dtype=start.dtype), start
     for A, wanted in orders:
         Y = metric.whiten(A.T)
-        left = matmul(free, Y)
         # Rows spanned by those of higher priority leave rounding errors, which must not count as directions.
-        # A decision on rank has no derivative.
-        sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, Y)]
-        left = jnp.where(sizes[0] > tolerance(None, Y) ** 2 * sizes[1], left, jnp.zeros_like(left))
+        left = drop_rounding(matmul(free, Y), Y)
         inverse = pseudo_inverse(left, tolerance(None, left)).T
         # Rows of lower priority correct what those above them have left, within the null space of these.
         a = a + metric.unwhiten(matmul(inverse, wanted - matmul(A, a)))
         # inverse left^T projects on the range of `left`, so that `free` remains an orthogonal projection.
         free = free - matmul(inverse, left.T)
     return a
+
+
+def drop_rounding(left: Array, whole: Array) -> Array:
+    """What a projection leaves of rows, or zeros where that is rounding of the whole rows."""
+    # A decision on rank has no derivative.
+    sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, whole)]
+    return jnp.where(sizes[0] > tolerance(None, whole) ** 2 * sizes[1], left, jnp.zeros_like(left))
 
 
 def regularity(system, q, t, A, T) -> Float[Array, ""]:
@@ -325,13 +313,8 @@ class ForceLoop(ForceIntegral):
         count = row_count(self.scene)
         if self.force is None:
             return jnp.zeros((count,), q.dtype)
-        force = self.force(t)
-        if jnp.shape(force) != (count,):
-            raise ValueError(
-                f"force has shape {jnp.shape(force)}, expected {(count,)}, one per row of the constraints"
-                f"{batch_hint(force, (count,))}"
-            )
-        return jnp.asarray(force, q.dtype)
+        of = ", one per row of the constraints"
+        return jnp.asarray(as_shape(self.force(t), "force", q.dtype, (count,), of=of))
 
     def force_command(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
         """Force command -lam_d + KI z."""

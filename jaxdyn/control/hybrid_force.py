@@ -31,6 +31,7 @@ from jaxdyn.control.errors import (
     as_matrix,
     as_target,
     constrained,
+    drop_rounding,
     gain,
     regularity,
     row_count,
@@ -42,7 +43,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, check_state
 from jaxdyn.model.numbers import as_number
 from jaxdyn.reduction.inverse_dynamics import velocity_choice
-from jaxdyn.reduction.quasi_velocities import gauge_invariant
+from jaxdyn.reduction.minimal import gauge_invariant
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import SceneLike, velocity_to_rate
 
@@ -342,10 +343,8 @@ class GaugeInvariant(ForceLoop):
         # Constraints first: J = d v / d xd is the inverse of the task's rows in the motions that these leave. It is the last
         # columns of the inverse of the stacked rows where that exists; elsewhere J s still satisfies the constraints.
         inverse = pseudo_inverse(A, tolerance(None, A))
-        left = T - matmul(matmul(T, inverse), A)
-        # Rounding errors of rows that depend on the constraints are no directions. Decisions on rank have no derivative.
-        sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, T)]
-        left = jnp.where(sizes[0] > tolerance(None, T) ** 2 * sizes[1], left, jnp.zeros_like(left))
+        # Rounding errors of rows that depend on the constraints are no directions.
+        left = drop_rounding(T - matmul(matmul(T, inverse), A), T)
         J = pseudo_inverse(left, tolerance(None, left))
         s, sdot = jax.jvp(reference, (q, t), motion)
         along = matmul(J, s)

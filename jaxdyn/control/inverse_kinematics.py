@@ -22,9 +22,8 @@ from jaxdyn.constraints.assembly import check_search, closing_tolerance, indepen
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
-from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant
+from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant, own_length
 from jaxdyn.constraints.selection import most_rounding
-from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.targets import Aims, as_targets, clip_to_limits, screw_joints, search, target_rows
 from jaxdyn.model.arguments import Checked, Given, Number, Numbers, as_operand, check_flag, check_mapping, check_state
 from jaxdyn.model.tree import Model
@@ -130,7 +129,7 @@ def inverse_kinematics(
         (posture,) = check_state(model, q_posture=posture)
     factors = row_weights(rows, weights, guess.dtype)
     # Forces and cones do not affect configurations: they are left out, so that others do not cause a second compilation.
-    place = _solve_by_program(
+    place = _solve(
         Scene(model, scene.constraints),
         rows,
         guess,
@@ -177,10 +176,6 @@ def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Given:
 
 
 @entry_point
-def _solve_by_program(scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
-    return _solve(scene, rows, guess, factors, posture, t, limits, steps, guesses, atol)
-
-
 def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
     model, every = scene.system, scene
     scene = independent_rows_near(scene, guess, t)
@@ -212,7 +207,8 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
 
     values = position_residual(whole, q, t)
     exact = aims.is_exact > 0
-    errors = values[np.flatnonzero(_is_target(scene, whole))]
+    # The rows of targets follow those of the constraints.
+    errors = values[holonomic_rows(layout(scene)).size :]
     counted = jnp.where(factors > 0, jnp.abs(errors), jnp.zeros_like(errors))
     opening = jnp.max(jnp.where(exact, jnp.abs(values), jnp.zeros_like(values)), initial=0.0)
     if has_selection(scene):
@@ -224,12 +220,6 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)
     result = RESULTS.where(reached, RESULTS.where(is_nearest, RESULTS.successful, RESULTS.not_nearest), result)
     return InverseKinematics(q, jnp.max(counted, initial=0.0), errors, opening, result, tried)
-
-
-def _is_target(scene: Scene, whole: Scene) -> np.ndarray:
-    """Mask of the position rows of `whole` that belong to targets; they follow those of the constraints."""
-    count = holonomic_rows(layout(scene)).size
-    return np.arange(holonomic_rows(layout(whole)).size) >= count
 
 
 def _reaches_targets(scene: Scene, q, t, aims: Aims):

@@ -145,6 +145,36 @@ def check_feet(model: Any, feet: Any) -> tuple[Foot, ...]:
     return tuple(feet)
 
 
+class GroundForces(eqx.Module):
+    """Weights and limits of the program for torques and ground forces of a `WholeBody`.
+
+    **Arguments:** `preload` (), N; `torque_weight`, `force_weight`, `effort_limit`, `passive` as of
+    `jd.control.underactuated_inverse_dynamics`.
+
+    **Raises:** ValueError for numbers that are negative.
+    """
+
+    preload: Array
+    torque_weight: Array
+    force_weight: Array
+    effort_limit: Array | None
+    passive: tuple[int, ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        preload: Numbers = 0.0,
+        torque_weight: Numbers = 1.0,
+        force_weight: Numbers = 1e-3,
+        effort_limit: Numbers | None = None,
+        passive: Checked[Sequence[int] | None] = None,
+    ):
+        self.preload = as_number(preload, "preload", zero=True)
+        self.torque_weight = as_number(torque_weight, "torque_weight", zero=True)
+        self.force_weight = as_number(force_weight, "force_weight", zero=True)
+        self.effort_limit = None if effort_limit is None else as_float(effort_limit, "effort_limit")
+        self.passive = None if passive is None else tuple(passive)
+
+
 class LeggedDynamics(Outcome):
     r"""Torques and ground forces for a given acceleration.
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import position_residual, rows
+from jaxdyn.contact.contact_equations import contact_coordinates
 from jaxdyn.contact.surfaces import Surface, check_surface
-from jaxdyn.contact.touching import contact_coordinates
 from jaxdyn.control.errors import (
     ConfigurationError,
     FrameError,
@@ -22,7 +22,7 @@ from jaxdyn.control.errors import (
     as_target,
     frame_error,
     gain,
-    least_acceleration,
+    hierarchical_acceleration,
     target_rows,
     times,
 )
@@ -35,7 +35,7 @@ from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import SceneLike, displacement, velocity_to_rate
+from jaxdyn.systems.system import SceneLike, displacement, has_coordinate_rates, velocity_to_rate
 
 
 class ComputedTorque(eqx.Module):
@@ -81,8 +81,8 @@ class ComputedTorque(eqx.Module):
         error = ConfigurationError(self.target)  # pyright: ignore[reportCallIssue]
         A, a = target_rows(system, error, self.kp, self.kd, q, v, t)
         # For v = dq/dt the rows are the unit matrix, and the right-hand side is the acceleration itself.
-        if not _is_flat(system):
-            a = least_acceleration(system, q, t, A, a, jnp.zeros_like(v))
+        if not has_coordinate_rates(system):
+            a = hierarchical_acceleration(system, q, t, [(A, a)], jnp.zeros_like(v))
         return torque_for(self.scene, q, v, a, t)
 
 
@@ -146,12 +146,12 @@ class OperationalSpace(eqx.Module):
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Joint torques (nv,), N m or N."""
         system, t = self.scene.system, jnp.asarray(t, q.dtype)
-        A, wanted = target_rows(system, self.error, self.kp, self.kd, q, v, t)
+        task = target_rows(system, self.error, self.kp, self.kd, q, v, t)
         rest = -self.damping.astype(v.dtype) * v
         if self.posture is not None:
             # Along the manifold: a difference of unit quaternions is no displacement.
             rest = rest - self.stiffness.astype(v.dtype) * displacement(system, self.posture, q)
-        return torque_for(self.scene, q, v, least_acceleration(system, q, t, A, wanted, rest), t)
+        return torque_for(self.scene, q, v, hierarchical_acceleration(system, q, t, [task], rest), t)
 
 
 class CartesianStiffness(eqx.Module):
@@ -216,12 +216,6 @@ def unconstrained(scene: Any) -> Scene:
             "jd.control.HybridForce or jd.control.GaugeInvariant"
         )
     return scene
-
-
-def _is_flat(system) -> bool:
-    """Decide whether v = dq/dt, so that the rows of a configuration error are a unit matrix."""
-    # The velocities of these joints are twists, or in moving axes, and no rates of coordinates.
-    return not (isinstance(system, Model) and {"planar", "spherical", "free"} & set(system.topology.kinds))
 
 
 def torque_for(scene: Scene, q, v, a, t) -> Float[Array, " nv"]:

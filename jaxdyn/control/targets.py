@@ -32,8 +32,8 @@ from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.rank import eps_of
+from jaxdyn.constraints.redundancy import coordinate_sizes
 from jaxdyn.constraints.rolling import tangents
-from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.errors import CenterError, Fixed
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul

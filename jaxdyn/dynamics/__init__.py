@@ -6,21 +6,25 @@ the matrix form in world axes and in link frames, and scans for many bodies (EQU
 Imports `systems` and what is below it. The four algorithms do not import each other.
 """
 
-from jaxdyn.dynamics.base_frame import base_twists as base_twists
-from jaxdyn.dynamics.base_frame import link_adjoints as link_adjoints
-from jaxdyn.dynamics.center_of_mass import ComDynamics as ComDynamics
-from jaxdyn.dynamics.center_of_mass import SpatialForm as SpatialForm
-from jaxdyn.dynamics.center_of_mass import com_dynamics as com_dynamics
-from jaxdyn.dynamics.center_of_mass import spatial_form as spatial_form
+from types import ModuleType as _ModuleType
+
+from jaxdyn.dynamics.centroidal import ComDynamics as ComDynamics
+from jaxdyn.dynamics.centroidal import SpatialForm as SpatialForm
 from jaxdyn.dynamics.centroidal import centroidal_momentum as centroidal_momentum
 from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_momentum_matrix
+from jaxdyn.dynamics.centroidal import com_dynamics as com_dynamics
+from jaxdyn.dynamics.centroidal import spatial_form as spatial_form
+from jaxdyn.dynamics.frame_motion import ArticulatedBodies as ArticulatedBodies
+from jaxdyn.dynamics.frame_motion import WorkspaceDynamics as WorkspaceDynamics
+from jaxdyn.dynamics.frame_motion import articulated_bodies as articulated_bodies
 from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
 from jaxdyn.dynamics.frame_motion import jacobian_dot_v as jacobian_dot_v
-from jaxdyn.dynamics.joint_wrenches import ArticulatedBodies as ArticulatedBodies
-from jaxdyn.dynamics.joint_wrenches import articulated_bodies as articulated_bodies
-from jaxdyn.dynamics.joint_wrenches import joint_wrench as joint_wrench
+from jaxdyn.dynamics.frame_motion import joint_wrench as joint_wrench
+from jaxdyn.dynamics.frame_motion import workspace_dynamics as workspace_dynamics
 from jaxdyn.dynamics.kinematics import spatial_jacobian as spatial_jacobian
 from jaxdyn.dynamics.link_frame import NewtonEulerMatrices as NewtonEulerMatrices
+from jaxdyn.dynamics.link_frame import base_twists as base_twists
+from jaxdyn.dynamics.link_frame import link_adjoints as link_adjoints
 from jaxdyn.dynamics.quantities import aba as aba
 from jaxdyn.dynamics.quantities import crba as crba
 from jaxdyn.dynamics.quantities import generalized_force as generalized_force
@@ -28,37 +32,8 @@ from jaxdyn.dynamics.quantities import mass_matrix_derivative as mass_matrix_der
 from jaxdyn.dynamics.quantities import mass_matrix_sqrt as mass_matrix_sqrt
 from jaxdyn.dynamics.quantities import rnea as rnea
 from jaxdyn.dynamics.quantities import torque_regressor as torque_regressor
-from jaxdyn.dynamics.workspace import WorkspaceDynamics as WorkspaceDynamics
-from jaxdyn.dynamics.workspace import workspace_dynamics as workspace_dynamics
-
-__all__ = [
-    "ArticulatedBodies",
-    "ComDynamics",
-    "NewtonEulerMatrices",
-    "SpatialForm",
-    "WorkspaceDynamics",
-    "aba",
-    "articulated_bodies",
-    "base_twists",
-    "centroidal_momentum",
-    "centroidal_momentum_matrix",
-    "com_dynamics",
-    "crba",
-    "frame_acceleration",
-    "generalized_force",
-    "jacobian_dot_v",
-    "joint_wrench",
-    "link_adjoints",
-    "mass_matrix_derivative",
-    "mass_matrix_sqrt",
-    "rnea",
-    "spatial_form",
-    "spatial_jacobian",
-    "torque_regressor",
-    "workspace_dynamics",
-]
 
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

@@ -9,7 +9,6 @@ Every function raises a ValueError that names the argument when a shape does not
 """
 
 import functools
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp, variant
-from jaxdyn.dynamics import recursions, scans, sizes, world_frame
+from jaxdyn.dynamics import recursions, scans, tree_frames, world_frame
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.recursions import sweeps
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state
@@ -169,75 +168,80 @@ def forward_dynamics(
     return kernel(form, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
 
 
-def _kernel_with_checks(recursion: Callable, is_large: Callable, of_many: Callable) -> Callable:
-    """Compile a recursion as a kernel with checks of its arguments; `of_many` computes the same of models that are large."""
-    signature = inspect.signature(recursion)
-
-    # One kernel for each set of arguments that are given: kernels take them by position, and recursions some by name alone.
-    @functools.cache
-    def by_kernel(names: tuple[str, ...]) -> Callable:
-        def function(model, *args):
-            return recursion(model, **dict(zip(names, args, strict=True)))
-
-        return kernel(functools.update_wrapper(function, recursion))
-
-    @functools.wraps(recursion)
-    def call(*args, **named):
-        # Bound by name, so that positional and named arguments pass the same checks.
-        (_, model), *rest = signature.bind(*args, **named).arguments.items()
-        checked = check_shapes(model, **dict(rest))
-        if is_large(model):
-            return of_many(model, **dict(rest))
-        return by_kernel(tuple(name for name, _ in rest))(model, *checked)
-
-    return call
-
-
-def _has_many_bodies(model: Model) -> bool:
-    return _recursions(model) is not recursions
-
-
 def _count_pairs(model: Model) -> int:
     return int(model.topology.ancestors.sum())
 
 
 def _is_dense(model: Model) -> bool:
     # Within a kernel the products of all pairs, related or not, are written out: a sparse matrix is better written by its own.
-    return _count_pairs(model) > max(sizes.MAX_PAIRS, model.nb**2 // 3)
+    return _count_pairs(model) > max(tree_frames.MAX_PAIRS, model.nb**2 // 3)
 
 
 @variant(_is_dense)
 def _has_many_pairs(model: Model) -> bool:
-    return model.nb > sizes.MAX_BODIES_IN_MATRIX or _count_pairs(model) > sizes.MAX_PAIRS
+    return model.nb > tree_frames.MAX_BODIES_IN_MATRIX or _count_pairs(model) > tree_frames.MAX_PAIRS
 
 
-def _rnea_of_many(model: Model, q, v, a, external=None):
-    return inverse_dynamics(model, q, v, jnp.zeros_like(v) if a is None else a, external=external)
+def rnea(
+    model: Model,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    a: Float[Array, " nv"] | None,
+    *,
+    external: Float[Array, "nb 6"] | None = None,
+) -> Float[Array, " nv"]:
+    r"""Inverse dynamics by the recursive Newton-Euler algorithm.
+
+    $$\tau = M a + C v + N - \sum_i J_i^T F_i$$
+
+    **Arguments:** `q` (nq,); `v`, `a` (nv,) joint velocities and accelerations (rad/s or m/s, rad/s^2 or m/s^2); `a` None is
+    zero acceleration, whose terms are left out. `external` (nb, 6): wrenches $F_i$ that act on the bodies, at their origins
+    in their axes (N, N m), or None.
+
+    **Returns:** generalised forces (nv,), N m or N. Armature included.
+
+    Source: EQUATIONS section 4; Luh, Walker & Paul (1980); Featherstone (2008) table 5.1.
+    """
+    check_shapes(model)  # a recursion is one over bodies
+    tau = bias_force(model, q, v) if a is None else inverse_dynamics(model, q, v, a)
+    return tau if external is None else tau - generalized_force(model, q, external)
 
 
-rnea = _kernel_with_checks(recursions.rnea, _has_many_bodies, _rnea_of_many)
-crba = _kernel_with_checks(recursions.crba, _has_many_pairs, mass_matrix)
-aba = _kernel_with_checks(recursions.aba, _has_many_bodies, forward_dynamics)
-# A square root has no loops yet.
-mass_matrix_sqrt = _kernel_with_checks(recursions.mass_matrix_sqrt, lambda model: False, recursions.mass_matrix_sqrt)
+def _by_name(recursion: Callable, quantity: Callable) -> Callable:
+    """A recursion by its own name: the quantity that it computes, of a tree of bodies alone."""
+
+    @functools.wraps(recursion)
+    def call(model, *args, **named):
+        check_shapes(model)
+        return quantity(model, *args, **named)
+
+    return call
+
+
+crba = _by_name(recursions.crba, mass_matrix)
+aba = _by_name(recursions.aba, forward_dynamics)
+mass_matrix_sqrt = _by_name(
+    recursions.mass_matrix_sqrt,
+    lambda model, q: kernel(recursions.mass_matrix_sqrt)(model, *check_shapes(model, q=q)),
+)
 
 # In small batches the mask form of the matrices is as fast as the loops.
 _MAX_BODIES_IN_MATRICES = 16
 
 
 # Inside of kernels, what is written out shares its numbers with the rest, such as the rows of loops.
-@variant(lambda: sizes.MAX_BODIES + 1)
+@variant(lambda: tree_frames.MAX_BODIES + 1)
 def _least_bodies_in_sweeps() -> int:
-    return sizes.MIN_BODIES_IN_SWEEPS
+    return tree_frames.MIN_BODIES_IN_SWEEPS
 
 
 def _recursions(model: Model) -> Any:
     """The module with the recursions of a model."""
     # Robots with floating bases have most axes at right angles.
-    least = sizes.MAX_BODIES + 1 if sweeps.has_base(model) else _least_bodies_in_sweeps()
+    least = tree_frames.MAX_BODIES + 1 if sweeps.has_base(model) else _least_bodies_in_sweeps()
     if model.nb >= least and sweeps.has_sweeps(model):
         return sweeps
-    return recursions if model.nb <= sizes.MAX_BODIES else scans
+    return recursions if model.nb <= tree_frames.MAX_BODIES else scans
 
 
 def by_recursion(recursion, matrices, model: Model, *args):
@@ -252,11 +256,11 @@ def by_recursion(recursion, matrices, model: Model, *args):
 
 def _by_matrices(matrices, model: Model, *args):
     """Evaluate products of matrices, whose operations grow with the square of the bodies: as a kernel of few of them."""
-    return matrices(model, *args) if model.nb > sizes.MAX_BODIES else kernel(matrices)(model, *args)
+    return matrices(model, *args) if model.nb > tree_frames.MAX_BODIES else kernel(matrices)(model, *args)
 
 
 def _inverse_dynamics(model: Model, q, v, a):
-    return (scans if model.nb > sizes.MAX_BODIES else world_frame).inverse_dynamics(model, q, v, a)
+    return (scans if model.nb > tree_frames.MAX_BODIES else world_frame).inverse_dynamics(model, q, v, a)
 
 
 def _bias_force(model: Model, q, v):
@@ -267,42 +271,38 @@ def _solve_for_acceleration(model: Model, q, v, tau):
     """Forward dynamics without a kernel, differentiated by the implicit function theorem."""
     form = scans if model.nb > _MAX_BODIES_IN_MATRICES else world_frame
 
-    def tangent(model, q, v, tau, steps):
-        return form.forward_dynamics_tangent(
-            model, q, v, tau, _force_tangent(_inverse_dynamics, model, q, v, tau, steps)
-        )
+    def tangent(*args):
+        return _value_and_tangent(_inverse_dynamics, form.acceleration_and_inverse, *args)
 
     return implicit(model, (q, v, tau), form.forward_dynamics, tangent)
 
 
-def _acceleration_tangent(inverse, solve, model: Model, q, v, tau, steps):
-    """Tangent M^-1 (dtau - dID at fixed a) of the acceleration, for tangents of the leaves of (model, q, v, tau)."""
-    return solve(model, q, v, tau, _force_tangent(inverse, model, q, v, tau, steps))[1]
+def _value_and_tangent(inverse_dynamics, solve, model: Model, q, v, tau, steps):
+    """The acceleration a, and its tangent M^-1 (dtau - dID at fixed a) for tangents of the leaves of (model, q, v, tau).
+
+    With ID(q, v, a) = tau. In reverse this costs one more M^-1 and one reverse pass of inverse dynamics.
+    """
+    a, times_inverse = solve(model, q, v, tau)
+    # The tangent of tau enters linearly and needs no derivative; None marks a zero tangent, for which nothing is computed.
+    *steps, change = steps
+    change = jnp.zeros_like(tau) if change is None else change
+    _, rate = value_and_jvp(lambda model, q, v: inverse_dynamics(model, q, v, a), (model, q, v), steps)
+    return a, times_inverse(change if rate is None else change - rate)
+
+
+def _tangent(*args):
+    return _value_and_tangent(*args)[1]
 
 
 # For each module of recursions its forward dynamics and their derivative.
 _FORWARD_DYNAMICS: dict[Any, tuple[Callable, Callable]] = {
-    module: (value, functools.partial(_acceleration_tangent, inverse, solve))
-    for module, value, inverse, solve in (
-        (recursions, recursions.aba, recursions.rnea, recursions.aba_tangent),
-        (sweeps, sweeps.aba, sweeps.rnea, sweeps.aba_tangent),
-        (scans, scans.forward_dynamics, scans.inverse_dynamics, scans.forward_dynamics_tangent),
+    form: (value, functools.partial(_tangent, inverse, form.acceleration_and_inverse))
+    for form, value, inverse in (
+        (recursions, recursions.aba, recursions.rnea),
+        (sweeps, sweeps.aba, sweeps.rnea),
+        (scans, scans.forward_dynamics, scans.inverse_dynamics),
     )
 }
-
-
-def _force_tangent(inverse, model, q, v, tau, steps):
-    """Function a -> dtau - dID(q, v, a) at fixed a."""
-    # The tangent of tau enters linearly and needs no derivative.
-    *steps, tau_step = steps
-
-    def change(a):
-        # None marks a zero tangent, for which nothing is computed.
-        total = jnp.zeros_like(tau) if tau_step is None else tau_step
-        _, rate = value_and_jvp(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
-        return total if rate is None else total - rate
-
-    return change
 
 
 def generalized_force(

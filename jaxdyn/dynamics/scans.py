@@ -151,11 +151,18 @@ def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
     return _flat(model, sweep(outward, model.topology.parents, jnp.zeros((6,), tau.dtype), rows)[1])
 
 
+def acceleration_and_inverse(model: Model, q, v, tau):
+    """Forward dynamics a (nv,), and the function f -> M^-1 f, from one factorisation by articulated bodies."""
+    links = _links(model, q)
+    factor = _factorize(model, links)
+    # Wrenches at zero joint acceleration carry C v + N, so the sweeps are those of M^-1 alone.
+    a = _solve(model, factor, tau, _wrenches(model, links, v, None)[0])
+    return a, lambda force: _solve(model, factor, force, None)
+
+
 def forward_dynamics(model: Model, q, v, tau) -> Float[Array, " nv"]:
     """Forward dynamics a = M^-1 (tau - C v - N) (nv,) by the articulated-body algorithm."""
-    links = _links(model, q)
-    # Wrenches at zero joint acceleration carry C v + N, so the sweeps are those of M^-1 alone.
-    return _solve(model, _factorize(model, links), tau, _wrenches(model, links, v, None)[0])
+    return acceleration_and_inverse(model, q, v, tau)[0]
 
 
 def articulated_bodies(model: Model, q, v, tau, external) -> tuple[Float[Array, "nb 6 6"], Float[Array, "nb 6"]]:
@@ -166,11 +173,3 @@ def articulated_bodies(model: Model, q, v, tau, external) -> tuple[Float[Array, 
     _, wrenches = _residuals(model, factor, tau, wrenches if external is None else wrenches - external)
     # The sweeps count accelerations from those of zero joint accelerations; b_i counts from rest.
     return factor.inertia, wrenches - jnp.einsum("bij,bj->bi", factor.inertia, rates, precision=lax.Precision.HIGHEST)
-
-
-def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
-    """Forward dynamics a and M^-1 times `force_change(a)` (nv,), both from one factorisation."""
-    links = _links(model, q)
-    factor = _factorize(model, links)
-    a = _solve(model, factor, tau, _wrenches(model, links, v, None)[0])
-    return a, _solve(model, factor, force_change(a), None)

@@ -100,31 +100,20 @@ def inverse_dynamics(
     return _inverse_dynamics(model, frame, tree_inertias(model, frame), v, a, external)
 
 
-def forward_dynamics(
-    model: Model,
-    q: Float[Array, " nq"],
-    v: Float[Array, " nv"],
-    tau: Float[Array, " nv"],
-    external: Float[Array, "nb 6"] | None = None,
-) -> Float[Array, " nv"]:
-    """Forward dynamics a = M^-1 (tau - C v - N + sum J_i^T external_i), by the Cholesky factor of M."""
-    frame = tree_frame(model, q)
-    inertias = tree_inertias(model, frame)
-    factor = cholesky(_mass_matrix(model, frame, inertias))
-    return solve_cholesky(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, external))
-
-
-def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
-    """Forward dynamics a and M^-1 times `force_change(a)` (nv,), both from one Cholesky factor.
-
-    With ID(q, v, a) = tau, a change of (model, q, v, tau) changes a by M^-1 (dtau - dID at fixed a); `force_change`
-    returns the bracket.
-    """
+def acceleration_and_inverse(model: Model, q, v, tau):
+    """Forward dynamics a (nv,), and the function f -> M^-1 f, from one Cholesky factor of M."""
     frame = tree_frame(model, q)
     inertias = tree_inertias(model, frame)
     factor = cholesky(_mass_matrix(model, frame, inertias))
     a = solve_cholesky(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, None))
-    return a, solve_cholesky(factor, force_change(a))
+    return a, lambda force: solve_cholesky(factor, force)
+
+
+def forward_dynamics(
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"]
+) -> Float[Array, " nv"]:
+    """Forward dynamics a = M^-1 (tau - C v - N), by the Cholesky factor of M."""
+    return acceleration_and_inverse(model, q, v, tau)[0]
 
 
 def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxdyn.compile import object_files, standalone
+from jaxdyn.compile import standalone
 from jaxdyn.compile.directions import Directions
-from jaxdyn.compile.object_files import HOST as HOST
-from jaxdyn.compile.object_files import TARGETS as TARGETS
 from jaxdyn.compile.objects import Code, code_of
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.standalone import DEGENERATE, Routine
+from jaxdyn.compile.standalone import HOST as HOST
+from jaxdyn.compile.standalone import TARGETS as TARGETS
 from jaxdyn.exports.arguments import (
     Argument,
     arguments_of,
@@ -206,7 +206,7 @@ class Exported:
         caller = getattr(self._local, which, None)
         if caller is None:
             if self._code is None:
-                self._code = code_of(self.module("packed", object_files.resolve_target(HOST).lanes))
+                self._code = code_of(self.module("packed", standalone.resolve_target(HOST).lanes))
             routine = self._routine(which)
             address = self._code.address(f"{routine.symbol}_packed")
             caller = _make_caller(address, self, routine.program, which == "function" and self._is_one_array)
@@ -272,8 +272,8 @@ class Exported:
                 "abi is 'casadi', whose functions take and return arrays of float64: export a function of such arrays only"
             )
         # Everything that can fail has been done when the first file is written.
-        resolved = object_files.resolve_target(target, cpu, features)
-        made = object_files.object_file(self.module(abi, resolved.lanes), resolved)
+        resolved = standalone.resolve_target(target, cpu, features)
+        made = standalone.object_file(self.module(abi, resolved.lanes), resolved)
         return write_files(self, Path(folder), made, resolved, abi)
 
 

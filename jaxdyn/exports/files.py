@@ -9,15 +9,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.object_files import ObjectFile, Triple
-from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE
+from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, LinkableFile, Triple
 from jaxdyn.exports.arguments import C_TYPES, Argument
 
 TOLERANCE = 1e-12  # of the test program, relative: other processors round fused operations otherwise
 _TOLERANCE_SINGLE = 1e-4  # a thousand roundings of float32, which accelerations of long chains lose
 
 
-def write_files(exported: Any, folder: Path, made: ObjectFile, target: Triple, abi: str) -> Path:
+def write_files(exported: Any, folder: Path, made: LinkableFile, target: Triple, abi: str) -> Path:
     """Write all files; none where one cannot be written. **Raises:** ValueError where the folder cannot be written."""
     name = exported.name
     contents: dict[str, bytes] = {f"{name}.o": made.binary}
@@ -44,7 +43,7 @@ def write_files(exported: Any, folder: Path, made: ObjectFile, target: Triple, a
 # --- the header ---
 
 
-def header(exported: Any, made: ObjectFile, target: Triple) -> str:
+def header(exported: Any, made: LinkableFile, target: Triple) -> str:
     """C header: sizes, structures, and one prototype for each function."""
     name, upper = exported.name, exported.name.upper()
     lines = [
@@ -78,7 +77,7 @@ def header(exported: Any, made: ObjectFile, target: Triple) -> str:
     return "\n".join(lines)
 
 
-def _definitions(exported: Any, made: ObjectFile) -> list[str]:
+def _definitions(exported: Any, made: LinkableFile) -> list[str]:
     """Lines with the sizes of arrays, the bytes of stack, and the structures."""
     name, upper = exported.name, exported.name.upper()
     lines = []
@@ -239,7 +238,7 @@ def _references(exported: Any) -> tuple[list[str], list[str]]:
     return data, checks
 
 
-def _build(name: str, made: ObjectFile) -> str:
+def _build(name: str, made: LinkableFile) -> str:
     # An interface library: the object file is all there is to it, and it goes into the program that links it.
     link = f"\ntarget_link_libraries({name} INTERFACE m)" if made.library else ""
     return f"""# target_link_libraries(your_program {name}) links the functions of {name}.h.
@@ -260,7 +259,7 @@ add_test({name}_test {name}_test)
 # --- CasADi ---
 
 
-def _casadi_build(name: str, made: ObjectFile) -> str:
+def _casadi_build(name: str, made: LinkableFile) -> str:
     return f"""# Makes {name}.so for casadi.external("{name}", "./{name}.so"); or: cc -shared -o {name}.so {name}.o -lm
 cmake_minimum_required(VERSION 3.16)
 project({name} C)

@@ -27,7 +27,7 @@ from jaxdyn.model.numbers import as_float
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import System, symbols
+from jaxdyn.systems.system import System, has_coordinate_rates, symbols
 
 KINDS = ("first", "second")
 
@@ -250,14 +250,10 @@ def _as_function(metric, t: Numbers = 0.0) -> Callable:
     **Raises:** ValueError for an argument that gives no metric.
     """
     # The formulas are those of a coordinate basis, v = dq/dt; quasi-velocities would need the structure constants too.
-    if isinstance(metric, Model) and metric.nq != metric.nv:
+    if isinstance(metric, Model) and not has_coordinate_rates(metric):
         raise ValueError(
             f"metric is model {metric.name!r} with nq = {metric.nq}, nv = {metric.nv}; a metric needs coordinates with "
-            "v = dq/dt, so build the model without spherical and free joints, or give g(q) in coordinates"
-        )
-    if isinstance(metric, Model) and "planar" in metric.topology.kinds:
-        raise ValueError(
-            f"metric is model {metric.name!r}, which has a planar joint, whose v is not dq/dt; give g(q) in coordinates"
+            "v = dq/dt, so build the model without planar, spherical and free joints, or give g(q) in coordinates"
         )
     if isinstance(metric, (Model, System)):
         return lambda q: mass_matrix(metric, q, t)

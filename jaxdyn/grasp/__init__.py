@@ -3,12 +3,11 @@
 Source: Murray, Li & Sastry (1994), chapters 5 and 6.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.contact.cones import wrench_basis as wrench_basis
 from jaxdyn.contact.forces import ContactForces as ContactForces
 from jaxdyn.contact.forces import contact_forces as contact_forces
-from jaxdyn.grasp.contacts import Contact as Contact
-from jaxdyn.grasp.contacts import contact as contact
-from jaxdyn.grasp.contacts import point_contacts as point_contacts
 from jaxdyn.grasp.dynamics import ObjectDynamics as ObjectDynamics
 from jaxdyn.grasp.dynamics import hand_dynamics as hand_dynamics
 from jaxdyn.grasp.dynamics import object_dynamics as object_dynamics
@@ -19,43 +18,19 @@ from jaxdyn.grasp.forces import hold as hold
 from jaxdyn.grasp.forces import internal_force_basis as internal_force_basis
 from jaxdyn.grasp.forces import joint_torques as joint_torques
 from jaxdyn.grasp.forces import normal_forces as normal_forces
+from jaxdyn.grasp.hand import Contact as Contact
 from jaxdyn.grasp.hand import Grasp as Grasp
+from jaxdyn.grasp.hand import contact as contact
 from jaxdyn.grasp.hand import grasp_map as grasp_map
 from jaxdyn.grasp.hand import hand_jacobian as hand_jacobian
 from jaxdyn.grasp.hand import internal_forces as internal_forces
-from jaxdyn.grasp.measures import Manipulability as Manipulability
-from jaxdyn.grasp.measures import manipulability as manipulability
+from jaxdyn.grasp.hand import point_contacts as point_contacts
 from jaxdyn.grasp.motions import HandMotions as HandMotions
+from jaxdyn.grasp.motions import Manipulability as Manipulability
 from jaxdyn.grasp.motions import hand_motions as hand_motions
-
-__all__ = [
-    "Contact",
-    "ContactForces",
-    "Grasp",
-    "HandForces",
-    "HandMotions",
-    "Manipulability",
-    "ObjectDynamics",
-    "contact",
-    "contact_forces",
-    "force_closure",
-    "forces_for_wrench",
-    "grasp_map",
-    "hand_dynamics",
-    "hand_jacobian",
-    "hand_motions",
-    "hold",
-    "internal_force_basis",
-    "internal_forces",
-    "joint_torques",
-    "manipulability",
-    "normal_forces",
-    "object_dynamics",
-    "point_contacts",
-    "wrench_basis",
-]
+from jaxdyn.grasp.motions import manipulability as manipulability
 
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

@@ -28,7 +28,7 @@ from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matr
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, check_motions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
+from jaxdyn.model.arguments import Numbers, as_shape, check_state, zeros_if_none
 from jaxdyn.reduction.bases import least_quality
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.system import velocity_to_rate
@@ -96,18 +96,13 @@ def object_dynamics(
     check_grasp(grasp)
     tau = zeros_if_none(tau, grasp.nv)
     q, tau, t = check_state(grasp.system, q=q, tau=tau, t=t)
-    V = as_array(V, "V", q.dtype)
     count, joints = layout(grasp)[-1].end, len(grasp.hand_velocities)
     if count != joints:
         raise ValueError(
             f"the contacts have {count} rows and the hand {joints} joints, so the hand Jacobian is not square; use "
             "jd.grasp.hand_dynamics(grasp, q, nu, tau), or choose other contacts"
         )
-    if V.shape != (len(grasp.object_velocities),):
-        raise ValueError(
-            f"V has shape {V.shape}, expected {(len(grasp.object_velocities),)}, the velocity of {grasp.object!r}"
-            f"{batch_hint(V, (1,))}"
-        )
+    V = as_shape(V, "V", q.dtype, (len(grasp.object_velocities),), of=f", the velocity of {grasp.object!r}")
     return _solve(grasp, q, V, tau, t)
 
 
@@ -163,12 +158,8 @@ def hand_dynamics(
             f"motions has rows for {motions.object.shape[0]} velocities of an object and {motions.internal.shape[0]} joints, "
             f"the grasp has {no} and {nh}; use jd.grasp.hand_motions(grasp, q)"
         )
-    nu = as_array(nu, "nu", q.dtype)
-    if nu.shape != (motions.size(grasp),):
-        raise ValueError(
-            f"nu has shape {nu.shape}, expected {(motions.size(grasp),)}: {motions.object.shape[1]} velocities of the object and "
-            f"{motions.internal.shape[1]} of the hand{batch_hint(nu, (1,))}"
-        )
+    of = f": {motions.object.shape[1]} velocities of the object and {motions.internal.shape[1]} of the hand"
+    nu = as_shape(nu, "nu", q.dtype, (motions.size(grasp),), of=of)
     return _solve_motions(independent_rows(grasp, q, t), motions, q, nu, tau, t)
 
 

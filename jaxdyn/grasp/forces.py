@@ -19,14 +19,18 @@ from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.codes import Outcome
 from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
-from jaxdyn.contact.closure import ForceClosure, force_closure_of_map
 from jaxdyn.contact.cones import Cones, components
-from jaxdyn.contact.forces import ContactWithCone, contacts_with_cones, optimal_forces
+from jaxdyn.contact.forces import (
+    ContactWithCone,
+    ForceClosure,
+    contacts_with_cones,
+    force_closure_of_map,
+    optimal_forces,
+)
 from jaxdyn.dynamics.quantities import gravity_force
-from jaxdyn.grasp.contacts import Contact
-from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian
+from jaxdyn.grasp.hand import Contact, Grasp, check_grasp, grasp_map, hand_jacobian
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_flag, check_state
+from jaxdyn.model.arguments import Numbers, as_array, as_shape, batch_hint, check_flag, check_state
 from jaxdyn.reduction.bases import orthonormal, split_directions
 
 
@@ -125,9 +129,7 @@ def forces_for_wrench(
     Source: Murray, Li & Sastry (1994), section 6.3, eq. 6.25; EQUATIONS section 10.
     """
     G = grasp_map(grasp, q, t)
-    wrench = as_array(wrench, "wrench", G.dtype)
-    if wrench.shape != G.shape[:1]:
-        raise ValueError(f"wrench has shape {wrench.shape}, expected {G.shape[:1]}{batch_hint(wrench, (1,))}")
+    wrench = as_shape(wrench, "wrench", G.dtype, G.shape[:1])
     return split_forces(G, wrench, as_preload(grasp, preload, G.dtype))
 
 
@@ -190,11 +192,7 @@ def hold(
     q, t = check_state(grasp.system, q=q, t=t)
     contacts = _every_cone(grasp, cones)
     if wrench is not None:
-        wrench = jnp.asarray(as_array(wrench, "wrench", q.dtype))
-        if wrench.shape != (len(grasp.object_velocities),):
-            raise ValueError(
-                f"wrench has shape {wrench.shape}, expected {(len(grasp.object_velocities),)}{batch_hint(wrench, (1,))}"
-            )
+        wrench = as_shape(wrench, "wrench", q.dtype, (len(grasp.object_velocities),))
     A, weight = _static(grasp, q, t)
     order = np.concatenate([contact.rows for contact in contacts])
     # In equilibrium the contacts exert h minus the other forces on the object.
@@ -258,10 +256,7 @@ def joint_torques(
     Source: Murray, Li & Sastry (1994), eq. 5.31; EQUATIONS section 10.
     """
     Jh = hand_jacobian(grasp, q, t)
-    lam = as_array(lam, "lam", Jh.dtype)
-    if lam.shape != Jh.shape[:1]:
-        raise ValueError(f"lam has shape {lam.shape}, expected {Jh.shape[:1]}{batch_hint(lam, (1,))}")
-    return matmul(Jh.T, lam)
+    return matmul(Jh.T, as_shape(lam, "lam", Jh.dtype, Jh.shape[:1]))
 
 
 def _every_cone(grasp: Grasp, cones) -> tuple[ContactWithCone, ...]:

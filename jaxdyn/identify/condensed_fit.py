@@ -17,17 +17,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.identify.condensed import Blocks, condense_rows, pad_triangle
-from jaxdyn.identify.descent import Descent, Watch, descend
-from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, LinearChart, TorqueProblem
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, root_mean_square
 from jaxdyn.identify.regression import (
     BaseParameters,
+    Blocks,
     base_parameters,
     condense_model,
+    condense_rows,
     coordinate_names,
     free_columns,
     noise_level,
+    pad_triangle,
     parameter_names,
 )
 from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_through_filter, term_columns
@@ -36,8 +37,8 @@ from jaxdyn.model.tree import Model
 
 # A unit of a coefficient makes this share of the joint's torque.
 _UNIT = 0.1
-# Tolerance on the loss of a fit, and of one that only compares settings; most steps of either.
-_FINE, _ROUGH, _STEPS = 1e-6, 1e-2, 200
+# Tolerance on the loss of a fit, and of one that only compares settings.
+_FINE, _ROUGH = 1e-6, 1e-2
 # Fits with weights or loads that follow from the fit before are repeated until one changes all parameters by less than this
 # share of their standard deviations for independent errors; most of them.
 _SETTLED, MOST_ROUNDS = 0.05, 30
@@ -80,13 +81,6 @@ class Data(NamedTuple):
                 result += [self.basic + column * self.blocks.nv + joint for joint in places]
             start += count
         return np.array(result, int)
-
-
-def minimize_torque_error(
-    problem: TorqueProblem, steps: int, tolerance: float, callback: Callable | None = None
-) -> Descent:
-    """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
-    return descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, callback))
 
 
 class Estimate(NamedTuple):
@@ -160,7 +154,7 @@ def fit_blocks(
 ) -> Estimate:
     """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for; `is_rough` for a comparison of settings.
 
-    `sizes` as of `signal_sizes`, `callback` as of `minimize_torque_error`.
+    `sizes` as of `signal_sizes`, `callback` as of `TorqueProblem.minimize`.
 
     **Raises:** ValueError for logs with torques of zero alone, or with fewer of them than unknowns.
     """
@@ -183,7 +177,7 @@ def fit_blocks(
     # Noise-free logs stay well posed by a small share of the torque.
     sigma = max(float(sigma), _FINEST * float(np.sqrt(np.mean(sizes[0] ** 2))))
     problem = TorqueProblem.of(chart, condensed, sigma, setting.prior)
-    end = minimize_torque_error(problem, _STEPS, _ROUGH if is_rough else _FINE, callback)
+    end = problem.minimize(_ROUGH if is_rough else _FINE, callback)
     origin, terms = end.last.point
     # Interior points never reach a bound. Exact zeros let `intervals` recognise the terms that are held there.
     terms = chart.clip_terms(terms)

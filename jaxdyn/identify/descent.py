@@ -3,9 +3,13 @@
 A checkpoint is its checksum and an archive of NumPy arrays, with the hash of the problem. It is written next to its
 final name, flushed to the disk, and renamed: a process that is killed at any time leaves the previous checkpoint, or the new one,
 and never half of one.
+
+Linear algebra on small matrices keeps to one thread: OpenBLAS shares products and factorisations of a hundred rows among all
+processors, whose threads then wait for each other: on two busy ones a search for terms took 61 s of their time instead of 4.
 """
 
 import abc
+import contextlib
 import dataclasses
 import hashlib
 import io
@@ -13,6 +17,7 @@ import os
 import pathlib
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -21,6 +26,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.model.arguments import as_path
@@ -276,3 +282,27 @@ def restore_leaves(kept: dict[str, np.ndarray], name: str, like: Any) -> Any:
     leaves, structure = jax.tree.flatten(arrays)
     restored = [jnp.asarray(kept[f"{name}_{i:03d}"], leaf.dtype) for i, leaf in enumerate(leaves)]
     return eqx.combine(jax.tree.unflatten(structure, restored), rest)
+
+
+class _OneThread(contextlib.ContextDecorator):
+    """Decorator of functions while which numpy's and scipy's linear algebra keeps to one thread."""
+
+    # The limit is one of the process. Of calls that overlap, in several threads, the first one sets it and the last one lifts it:
+    # each for itself would take the limit of another one for the user's.
+    lock, running = threading.Lock(), 0
+    limit: Any = None
+
+    def __enter__(self):
+        with self.lock:
+            if not self.running:
+                self.limit = threadpool_limits(limits=1, user_api="blas")
+            self.running += 1
+
+    def __exit__(self, *_):
+        with self.lock:
+            self.running -= 1
+            if not self.running:
+                self.limit.restore_original_limits()
+
+
+on_one_thread = _OneThread()

@@ -4,7 +4,7 @@ A fit takes some tens of steps with matrices of a few hundred rows, and a search
 takes about a millisecond, and nothing is compiled.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,17 +12,21 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Block, Inertias, Numbers, Tied
 from jaxdyn.identify.chart import FROM_PSEUDO, LOG_CHOLESKY_BASIS, LOG_CHOLESKY_PLACES, make_chart
-from jaxdyn.identify.condensed import Condensed
-from jaxdyn.identify.descent import Iterate, Method
-from jaxdyn.identify.regression import free_columns, nominal_parameters
+from jaxdyn.identify.descent import Descent, Iterate, Method, Watch, descend
+from jaxdyn.identify.regression import Condensed, free_columns, nominal_parameters
 from jaxdyn.identify.torque_terms import POSITIVE
 from jaxdyn.model.tree import Model
 
 _EPS = float(np.finfo(np.float64).eps)
+# Most steps.
+_STEPS = 200
 
 
 class TorqueProblem(NamedTuple):
-    """Convex problem 1/2 (|R x - d|^2 + rest) + prior D(x) in float64, squares over the variance, in a chart's coordinates."""
+    """Convex problem 1/2 (|R x - d|^2 + rest) + prior D(x) in float64, squares over the variance, in a chart's coordinates.
+
+    All fits by torques that are linear in the numbers pose it: of robots, of payloads, and of parameters.
+    """
 
     chart: "LinearChart"
     R: np.ndarray
@@ -43,6 +47,10 @@ class TorqueProblem(NamedTuple):
                 "the torques of the logs are all zero; a fit by torques needs logs of a robot that is driven"
             )
         return cls(chart, condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, prior)
+
+    def minimize(self, tolerance: float, callback: Callable | None = None) -> Descent:
+        """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
+        return descend(InteriorPoint(self, tolerance), self.chart.start, Watch(_STEPS, callback))
 
     def loss(self, origin: np.ndarray, terms: np.ndarray) -> float:
         """Loss at relative pseudo-inertias A A^T, A the `origin`, and terms."""
@@ -106,6 +114,16 @@ class LinearChart(NamedTuple):
     def jacobian(self, origin: np.ndarray) -> np.ndarray:
         """Jacobian (p, n) of all parameters by the coordinates of the bodies, then by the terms."""
         return self.rows(np.eye(len(self.given)), self.body_jacobians(origin))
+
+    def coordinate_jacobian(self, origin: np.ndarray, terms: np.ndarray) -> np.ndarray:
+        """Jacobian (p, p) of all numbers by log-Cholesky coordinates and logarithms of positive terms, of a `block_chart`."""
+        half = log_cholesky_jacobian(origin, self.count) @ np.swapaxes(origin, 1, 2)[:, None]
+        blocks = np.einsum("cij,bkij->bck", self.read, half + np.swapaxes(half, 2, 3))
+        result = np.zeros((len(self.given),) * 2)
+        for places, block in zip(self.places, blocks, strict=True):
+            result[np.ix_(places, places)] = block
+        result[self.term_places, self.term_places] = np.where(self.positive, terms, 1.0)
+        return result
 
     def rows(self, R: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
         """Jacobian (m, n) of R x by the coordinates of the bodies, then by the terms."""
@@ -190,6 +208,16 @@ def log_cholesky_coordinates(origin: np.ndarray, count: int) -> np.ndarray:
     logarithms = np.log(np.stack([last, *(relative[:, i, i] for i in range(3))], axis=1))
     others = np.stack([relative[(slice(None), *place)] for place in LOG_CHOLESKY_PLACES[3:]], axis=1)
     return np.concatenate([logarithms, others], axis=1)[:, :count]
+
+
+def log_cholesky_jacobian(origin: np.ndarray, count: int) -> np.ndarray:
+    """Derivatives (bodies, count, 4, 4) of the factors `origin` (bodies, 4, 4) by their `log_cholesky_coordinates`."""
+    result = np.zeros((len(origin), 10, 4, 4))
+    result[:, 0] = origin
+    for k, place in enumerate(LOG_CHOLESKY_PLACES, 1):
+        # Entries on the diagonal are exponentials, the others multiples of the last one.
+        result[(slice(None), k, *place)] = origin[(slice(None), *place)] if k < 4 else origin[:, 3, 3]
+    return result[:, :count]
 
 
 class InteriorPoint(Method):

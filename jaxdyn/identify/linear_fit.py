@@ -6,8 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxdyn.identify.condensed import condense_rows
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.logs import Log, as_logs, check_log
 from jaxdyn.identify.regression import (
     BaseParameters,
@@ -15,6 +14,7 @@ from jaxdyn.identify.regression import (
     check_weights,
     condense,
     condense_model,
+    condense_rows,
     free_columns,
     least_squares_by_svd,
     model_torques,

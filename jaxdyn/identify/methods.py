@@ -8,6 +8,7 @@ Source: Marquardt (1963), damping; Bock (1983), elimination of the initial state
 """
 
 import contextlib
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -35,7 +36,8 @@ class Unknowns(eqx.Module):
     start: Float[Array, "segments 2 nv"] | None
 
 
-class LinearErrors(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class LinearErrors:
     """Errors near a point, at the best initial states: errors + rows dy, at dstart = -(offset + gain dy).
 
     `errors` (n,); `rows` (n, p); `offset` (segments, 2 nv) and `gain` (segments, 2 nv, p) where initial states are free.
@@ -56,9 +58,14 @@ class LinearErrors(NamedTuple):
         """True where a step can be computed from here."""
         return bool(np.isfinite(self.loss) and np.isfinite(self.rows).all())
 
+    @functools.cached_property
+    def normal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations: half of the Hessian (p, p) and of the gradient (p,) of the loss."""
+        return self.rows.T @ self.rows, self.rows.T @ self.errors
+
     def step(self, damping: float) -> tuple[np.ndarray, float]:
         """Step dy (p,) and the decrease of the loss that it predicts; `damping` in shares of the largest curvature."""
-        hessian, gradient = self.rows.T @ self.rows, self.rows.T @ self.errors
+        hessian, gradient = self.normal
         # The floor keeps a Hessian of zeros solvable; its step is zero, and the fit ends.
         size = damping * max(float(np.diag(hessian).max()), 1e-300)
         dy = -np.linalg.solve(hessian + size * np.eye(len(hessian)), gradient)
@@ -105,7 +112,8 @@ def eliminate_starts(errors, by_y, by_start) -> LinearErrors:
 def with_prior(data: LinearErrors, residual, rows, weight: float) -> LinearErrors:
     """Errors of the data followed by those of the prior, whose squares count `weight` times."""
     residual, rows = (weight**0.5 * np.asarray(x, np.float64) for x in (residual, rows))
-    return data._replace(
+    return dataclasses.replace(
+        data,
         loss=data.loss + float(residual @ residual),
         errors=np.concatenate([data.errors, residual]),
         rows=np.concatenate([data.rows, rows]),

@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
+from jaxdyn.identify.mechanisms import Measured
 from jaxdyn.identify.methods import METHODS, SOLVERS, Optimizer
 from jaxdyn.identify.replay import (
     HOLDS,
@@ -40,7 +41,7 @@ from jaxdyn.identify.replay import (
     simulation_options,
 )
 from jaxdyn.identify.result import inverse_torque, project_to_motors
-from jaxdyn.identify.sensors import Measured
+from jaxdyn.identify.torque_terms import friction_of
 from jaxdyn.model.arguments import Checked, FilePath, SystemLike, check_mapping, warn
 from jaxdyn.model.numbers import as_static, check_count, check_seed
 from jaxdyn.simulation.controls import Control
@@ -180,6 +181,8 @@ class Objective(eqx.Module):
         segment = correct_sensors(measured, segment, None if self.error in SIMULATED else self.hold)
         if self.error == "torque":
             errors = jax.vmap(partial(torque, scene))(segment.q, segment.v, segment.a, segment.t) - segment.tau
+            if segment.smoothing is not None:
+                errors = errors + friction_of(scene).coulomb[None] * segment.smoothing
             if scene.constraints:
                 errors = jax.vmap(partial(project_to_motors, scene, self.observed))(
                     segment.q, segment.v, segment.t, errors
@@ -192,7 +195,8 @@ class Objective(eqx.Module):
         start = None if change is None else change * scale[:2]
         simulated = partial(simulate_segment, scene, segment, start, self.hold, self.simulation, observed=self.observed)
         if self.error == "trajectory":
-            law = SampledTorque(segment.t + measured.delay, segment.tau, self.hold)
+            t, tau = jnp.asarray(segment.t), jnp.asarray(segment.tau)
+            law = SampledTorque(t + measured.delay, tau, self.hold)
             q, v = simulated(control=law)
             return jnp.concatenate(
                 [self._select_columns(e) for e in motion_errors(system, segment, q, v, scale)], axis=1
@@ -211,7 +215,7 @@ def correct_sensors(measured: Measured, segment: Segments, hold: str | None) -> 
     q = jax.vmap(lambda q: displace(system, q, -measured.position_bias))(segment.q)
     tau = measured.torque_gain[None] * segment.tau + measured.torque_bias[None]
     if hold is not None and segment.tau.shape[0] > 1:
-        law = SampledTorque(segment.t, tau, hold)
+        law = SampledTorque(jnp.asarray(segment.t), tau, hold)
         # Interpolated torques have kinks at the samples; the derivative there is that of the next interval.
         tau = jax.vmap(lambda t: law.at(t - measured.delay))(segment.t)
     return eqx.tree_at(lambda p: (p.q, p.tau), segment, (q, tau))

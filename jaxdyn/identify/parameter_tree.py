@@ -27,8 +27,8 @@ from jaxdyn.identify.blocks import (
     select,
 )
 from jaxdyn.identify.chart import METRICS, make_chart
+from jaxdyn.identify.mechanisms import FitSystem, Measured, build_scene
 from jaxdyn.identify.regression import NUMBERS
-from jaxdyn.identify.sensors import FitSystem, Measured, with_sensors
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Function, Number, deprecated, state_dtype
 from jaxdyn.model.arguments import Numbers as Values
@@ -243,7 +243,7 @@ class Parameters(eqx.Module):
     @property
     def dtype(self) -> np.dtype:
         """Floating-point type of the coordinates."""
-        return state_dtype(with_sensors(self.given).scene.system)
+        return state_dtype(build_scene(self.given).system)
 
     @property
     def keeps_regressor(self) -> bool:
@@ -260,15 +260,19 @@ class Parameters(eqx.Module):
 
     def system(self, y: Float[Array, " p"]) -> PyTree:
         """System as given, with the numbers of y."""
+        return self.replace(apply_blocks(self, y, None)[0])
+
+    def replace(self, changed: Mapping[int, Array]) -> PyTree:
+        """System as given, with other leaves at some places."""
         leaves, structure = jax.tree.flatten(self.given)
         # Frozen leaves stay the same objects, by whose identity other code recognises them.
-        for place, leaf in apply_blocks(self, y, None)[0].items():
+        for place, leaf in changed.items():
             leaves[place] = leaf
         return jax.tree.unflatten(structure, leaves)
 
     def scene(self, y: Float[Array, " p"]) -> Scene:
         """Scene with the numbers of y."""
-        return with_sensors(self.system(y)).scene
+        return build_scene(self.system(y))
 
     def values(self, y: Float[Array, " p"]) -> Float[Array, " m"]:
         """Numbers (m,) in the order of `names`."""

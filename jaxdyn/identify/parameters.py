@@ -1,5 +1,6 @@
 """Fit of any numbers of any system or scene by the error of torques, balances or simulated motion."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,12 +12,10 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Inertias
-from jaxdyn.identify.condensed import condense_rows
-from jaxdyn.identify.condensed_fit import minimize_torque_error
-from jaxdyn.identify.descent import Descent, Watch, checkpoint_at, descend
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import Descent, Watch, checkpoint_at, descend, on_one_thread
 from jaxdyn.identify.interior import TorqueProblem, block_chart, log_cholesky_coordinates
 from jaxdyn.identify.logs import Log
+from jaxdyn.identify.mechanisms import FitSystem
 from jaxdyn.identify.methods import (
     DAMPING,
     SOLVERS,
@@ -27,28 +26,31 @@ from jaxdyn.identify.methods import (
     Unknowns,
     confirm_minimum,
     propose,
+    with_prior,
 )
 from jaxdyn.identify.options import GAUSS_NEWTON, Execution, Objective, Solver, merge_options
 from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.problem import (
+    NumbersAt,
     Problem,
+    data_errors_at,
     errors_of,
     explain_not_finite,
     linearise,
     linearise_batch,
     loss_of,
+    numbers_at,
     on_one_device,
     pose_problem,
-    values_and_jacobian,
 )
+from jaxdyn.identify.regression import Blocks, condense_rows
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.sensors import FitSystem
-from jaxdyn.identify.uncertainty import error_groups, standard_deviations, student
+from jaxdyn.identify.uncertainty import ErrorRows, standard_deviations, student
 from jaxdyn.model.arguments import Checked, Function
 from jaxdyn.tasks import count_workers, map_tasks
 
-# Of the interior point: most steps, and the excess of its loss over the minimum as a share of the prior's weight.
-_CONVEX_STEPS, _EXCESS = 200, 1e-9
+# Excess of the loss of the interior point over the minimum, as a share of the prior's weight.
+_EXCESS = 1e-9
 # Of the starts: rough, as the best one is fitted to the end afterwards, so that only the order of the losses matters.
 _STEPS, _TOLERANCE = 20, 1e-4
 
@@ -107,22 +109,19 @@ def fit_parameters(
     report = None if callback is None else lambda step, loss, at: callback(step, loss, tree.system(at.y))
     key = checkpoint_at(execution.checkpoint, numbers, execution.every, execution.resume)
     watch = Watch(int(solver.steps), report, checkpoint=key, show=execution.progress, seconds=execution.seconds)
-    end, linear = _minimise(problem, unknowns, solver, watch)
-    y = end.best.point.y
-    values, jacobian = (np.asarray(x, np.float64) for x in values_and_jacobian(tree, y))
+    nominal = numbers_at(tree, tree.start)
+    end, minimum = _minimise(problem, logs, unknowns, nominal, solver, watch)
+    at = numbers_at(tree, end.best.point.y) if minimum is None or minimum.numbers is None else minimum.numbers
+    values, jacobian = (np.asarray(x, np.float64) for x in at[:2])
     deviation, factor = None, np.nan
-    if linear is not None and not linear.is_finite:
-        deviation = np.full(len(jacobian), np.nan)
-    elif linear is not None:
-        groups = error_groups(problem, logs, linear.errors[: len(linear.errors) - linear.priors])
-        # Groups are numbered from zero: the largest number is the degrees of freedom, groups - 1.
-        deviation, factor = standard_deviations(linear, jacobian, groups), student(int(groups.max(initial=1)))
+    if minimum is not None:
+        deviation, factor = minimum.deviations(jacobian)
     return Fit(
-        system=tree.system(y),
+        system=tree.replace(at.leaves),
         nominal=system,
         names=tree.names,
         values=values,
-        nominal_values=np.asarray(values_and_jacobian(tree, tree.start)[0], np.float64),
+        nominal_values=np.asarray(nominal.values, np.float64),
         deviation=deviation,
         factor=factor,
         history=end.history,
@@ -130,27 +129,62 @@ def fit_parameters(
         method=f"{objective.error} fit by {solver.name}",
         cause=explain_not_finite(problem, watch.failed, logs) if end.result is RESULTS.nonfinite else None,
         motors=problem.objective.observed,
+        as_measured=any(batch.smoothing is not None for batch in problem.batches),
     )
 
 
+class Minimum(NamedTuple):
+    """Errors of the data near a minimum, condensed, and in full (n,); `prior` (k, p): rows of the prior, of unit deviation.
+
+    `layout`: rows of the errors; `used`: errors that initial states have used up; `numbers` there, if known. No `blocks` for
+    errors that are not finite.
+    """
+
+    layout: ErrorRows
+    blocks: Blocks | None
+    errors: np.ndarray
+    prior: np.ndarray
+    used: int = 0
+    numbers: NumbersAt | None = None
+
+    @classmethod
+    def of(cls, problem: Problem, logs: Sequence[Log], linear: LinearErrors) -> "Minimum":
+        """Condense linear errors."""
+        count = len(linear.errors) - linear.priors
+        layout, errors = ErrorRows.of(problem, logs, count), linear.errors[:count]
+        blocks = layout.condense(linear.rows[:count], errors) if linear.is_finite else None
+        return cls(layout, blocks, errors, linear.rows[count:] / linear.prior_weight**0.5, linear.start_rank)
+
+    def deviations(self, jacobian: np.ndarray) -> tuple[np.ndarray, float]:
+        """Standard deviations (m,) of numbers with the Jacobian (m, p), and the factor of a 95 % interval."""
+        if self.blocks is None:
+            return np.full(len(jacobian), np.nan), np.nan
+        groups = self.layout.groups(self.errors)
+        deviations = standard_deviations(self.blocks, groups, self.prior, jacobian, self.used)
+        return deviations, student(max(len(groups) - 1, 1))
+
+
 def _minimise(
-    problem: Problem, unknowns: Unknowns, solver: Solver, watch: Watch
-) -> tuple[Descent, LinearErrors | None]:
+    problem: Problem, logs: Sequence[Log], unknowns: Unknowns, nominal: NumbersAt, solver: Solver, watch: Watch
+) -> tuple[Descent, Minimum | None]:
     """End of a minimisation, and the errors near it; None where the method takes no Jacobian."""
     rounding = float(jnp.finfo(unknowns.y.dtype).eps)
     if solver.name == GAUSS_NEWTON:
-        start, known, before = unknowns, None, np.zeros(0)
+        start, known, before, minimum = unknowns, None, np.zeros(0), None
         if solver.starts == 1:
-            start, known, before = minimize_linear_torques(problem, unknowns)
+            start, known, before, minimum = minimize_linear_torques(problem, logs, unknowns, nominal)
         end = descend(GaussNewton(partial(linearise, problem), solver.tolerance, rounding, known), start, watch)
         # Only steps that lower the loss are accepted: the last point is the best one.
         linear, history = end.last.state[0], np.concatenate([before, end.history])
         result = confirm_minimum(end.result, linear, solver.tolerance, rounding)
-        return Descent(end.last, end.last, history, result), linear
+        if minimum is None or linear is not known:
+            minimum = Minimum.of(problem, logs, linear)
+        return Descent(end.last, end.last, history, result), minimum
     if solver.name in SOLVERS:
         end = descend(LeastSquaresSteps(errors_of, problem, solver.name, solver.tolerance), unknowns, watch)
         linear = linearise(problem, end.best.point)
-        return end._replace(result=confirm_minimum(end.result, linear, solver.tolerance, rounding)), linear
+        result = confirm_minimum(end.result, linear, solver.tolerance, rounding)
+        return end._replace(result=result), Minimum.of(problem, logs, linear)
     steps = GradientSteps(
         loss_of,
         problem,
@@ -162,36 +196,54 @@ def _minimise(
     return descend(steps, unknowns, watch), None
 
 
-def minimize_linear_torques(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, LinearErrors | None, np.ndarray]:
+def minimize_linear_torques(
+    problem: Problem, logs: Sequence[Log], unknowns: Unknowns, nominal: NumbersAt
+) -> tuple[Unknowns, LinearErrors | None, np.ndarray, Minimum | None]:
     """Minimum of the error of torques that are linear in the numbers, by the steps of `fit_torques`, and the losses before it.
 
-    With the linear errors there, None where the torques are no such function.
+    With the linear errors there, None where no step can find one.
 
-    The errors along straight lines in the numbers are those at the start and their Jacobian there times the change z. Unknowns
-    other than those of `block_chart` stay where they are. Where the minimum is none, as the torques are not linear after all, so
-    do these.
+    The errors along straight lines in the numbers are those at the start and their Jacobian there times the change z, so that one
+    Jacobian, condensed, is enough. Unknowns other than those of `block_chart` stay where they are. Where the torques are not
+    linear after all, Gauss-Newton steps follow, from the start where it is better.
     """
     chart = block_chart(problem.tree.blocks) if problem.objective.error == "torque" else None
     if chart is None:
-        return unknowns, None, np.zeros(0)
-    here = linearise(problem, unknowns)
+        return unknowns, None, np.zeros(0), None
+    here = linearise(problem, unknowns, nominal)
     if not here.is_finite:
-        return unknowns, here, np.zeros(0)
+        return unknowns, here, np.zeros(0), None
     (weight,) = (float(block.weight) for block in problem.tree.blocks if isinstance(block, Inertias))
+    first = Minimum.of(problem, logs, here)
+    blocks: Any = first.blocks
     # The divergence replaces the residuals of the inertias' prior; those of other numbers are linear.
-    data = np.arange(len(here.errors)) < len(here.errors) - here.priors
-    kept = data | ~np.any(here.rows[:, chart.places.reshape(-1)] != 0, axis=1)
-    # Twice the loss: `TorqueProblem` has half of the squares.
-    rows = 2**0.5 * np.concatenate([here.rows[kept], -here.errors[kept, None]], axis=1)
-    condensed, prior = condense_rows(rows, int(data.sum())), weight * problem.prior_weight
-    convex = TorqueProblem(chart, condensed.R, condensed.d, condensed.rest, prior)
-    end = minimize_torque_error(convex, _CONVEX_STEPS, _EXCESS * prior)
+    count, places = len(first.errors), chart.places.reshape(-1)
+    others = np.flatnonzero(~np.any(here.rows[count:, places] != 0, axis=1)) + count
+    rows = np.concatenate([here.rows[others], -here.errors[others, None]], axis=1)
+    rows = np.concatenate([blocks.rows(np.ones(1)), rows])
+    prior = weight * problem.prior_weight
+    # A deviation for which `TorqueProblem`, with half of the squares, has this loss.
+    end = TorqueProblem.of(chart, condense_rows(rows, count), 0.5**0.5, prior).minimize(_EXCESS * prior)
     y, (origin, terms) = np.zeros(unknowns.y.size), end.last.point
-    y[chart.places.reshape(-1)] = log_cholesky_coordinates(origin, chart.count).reshape(-1)
+    y[places] = log_cholesky_coordinates(origin, chart.count).reshape(-1)
     y[chart.term_places] = np.where(chart.positive, np.log(np.where(chart.positive, terms, 1.0)), terms)
-    there = Unknowns(jnp.asarray(y, unknowns.y.dtype), None)
-    found = linearise(problem, there)
-    return (there, found, end.history[:-1]) if found.loss < here.loss else (unknowns, here, np.zeros(0))
+    there, z = Unknowns(jnp.asarray(y, unknowns.y.dtype), None), chart.x(origin, terms)
+    errors = np.asarray(data_errors_at(there, problem), np.float64)
+    rounding = float(jnp.finfo(unknowns.y.dtype).eps)
+    off = np.linalg.norm(first.errors + here.rows[:count] @ z - errors)
+    if not off <= rounding ** (2 / 3) * (np.linalg.norm(first.errors) + np.linalg.norm(errors)):
+        found = linearise(problem, there)
+        return (there, found, end.history[:-1], None) if found.loss < here.loss else (unknowns, here, np.zeros(0), None)
+    # The same triangles, by y near the minimum.
+    T = chart.coordinate_jacobian(origin, terms)
+    triangles = [[np.column_stack([R[:, :-1] @ T, R @ np.append(-z, 1.0)])] for (R,) in blocks.triangles]
+    blocks = dataclasses.replace(blocks, triangles=triangles)
+    rows = blocks.rows(np.ones(1))
+    data = LinearErrors(float(errors @ errors), -rows[:, -1], rows[:, :-1])
+    numbers = numbers_at(problem.tree, there.y)
+    residual, by_y = (np.asarray(x, np.float64) for x in numbers[2:4])
+    found = with_prior(data, residual, by_y, problem.prior_weight)
+    return there, found, end.history[:-1], first._replace(blocks=blocks, errors=errors, prior=by_y, numbers=numbers)
 
 
 def _best_start(problem: Problem, unknowns: Unknowns, solver: Solver, execution: Execution) -> Unknowns:

@@ -1,27 +1,114 @@
-"""Errors of a fit and of its prior as functions of the unknowns, their Jacobians, and the cause where they are not finite."""
+"""Errors of a fit and of its prior as functions of the unknowns, their Jacobians, and the cause where they are not finite.
+
+Segments are independent, like the samples of a batch. Each device evaluates its own segments and their gradients; an iteration
+of a fit exchanges one all-reduce of as many numbers as there are unknowns.
+"""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.devices import map_by_device, shard_blocks, sum_over_devices
+from jaxdyn.identify.blocks import apply_blocks
 from jaxdyn.identify.logs import Log, as_logs
-from jaxdyn.identify.mechanisms import check_motors, observation_columns
+from jaxdyn.identify.mechanisms import Measured, build_scene, check_motors, observation_columns, with_sensors
 from jaxdyn.identify.methods import LinearErrors, Unknowns, eliminate_starts, with_prior
 from jaxdyn.identify.options import BALANCES, SIMULATED, Objective
 from jaxdyn.identify.parameter_tree import Parameters
-from jaxdyn.identify.replay import Segments, check_spacing, segments, simulation_options, with_even_steps
+from jaxdyn.identify.replay import Segments, check_spacing, cut_segments, simulation_options, with_even_steps
 from jaxdyn.identify.result import inverse_torque, regressor_torque
-from jaxdyn.identify.sensors import Measured, with_sensors
+from jaxdyn.identify.torque_terms import Friction, smoothing_by_filter
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import has_drives
+
+AXIS = "segments"
+
+
+def shard_blocks(pieces: Any, devices: Sequence[Any] | None) -> tuple[Any, Any]:
+    """Shard segments (leading axis of arrays) over as many devices as divide their number, and make the mesh of these.
+
+    The mesh is None for one device, or where `devices` is None; the segments then stay where they are.
+
+    **Raises:** ValueError for no device.
+    """
+    if devices is None:
+        return pieces, None
+    if not len(devices):
+        raise ValueError("devices is empty; give some of jax.devices(), or None for one")
+    count = len(jax.tree.leaves(pieces)[0])
+    # Shards have equal size; segments added to fill one up would count in the loss.
+    most = max(n for n in range(1, len(devices) + 1) if count % n == 0)
+    if most == 1:
+        return pieces, None
+    mesh = jax.make_mesh((most,), (AXIS,), devices=list(devices)[:most], axis_types=(jax.sharding.AxisType.Auto,))
+    return jax.device_put(pieces, jax.NamedSharding(mesh, jax.P(AXIS))), mesh
+
+
+def map_by_device(function: Callable, mesh: Any) -> Callable:
+    """Map `function(shared, pieces)`, whose results have the axis of the segments, over the devices."""
+    return function if mesh is None else _by_device(function, mesh, jax.P(AXIS))
+
+
+def sum_over_devices(function: Callable, mesh: Any) -> Callable:
+    """Sum over devices of `function(searched, known)`, which adds up over the segments of one device.
+
+    `searched` and `known` are pairs of pytrees: shared by all devices, and with the axis of the segments. Derivatives are by
+    `searched`, in reverse mode and of first order. Each device computes its own, and those by shared unknowns
+    are in the same all-reduce as the sum itself.
+    """
+    if mesh is None:
+        return function
+    rows = jax.P(), jax.P(AXIS)
+
+    def value(shared, pieces):
+        return lax.psum(function((shared[0], pieces[0]), (shared[1], pieces[1])), AXIS)
+
+    def both(shared, pieces):
+        searched, known = (shared[0], pieces[0]), (shared[1], pieces[1])
+        loss, gradients = jax.value_and_grad(function)(searched, known)
+        loss, of_all = lax.psum((loss, gradients[0]), AXIS)
+        return (loss, of_all), gradients[1]
+
+    @eqx.filter_custom_vjp
+    def total(searched, known):
+        return _by_device(value, mesh, jax.P())(*zip(searched, known, strict=True))
+
+    @total.def_fwd
+    def _(perturbed, searched, known):
+        (loss, of_all), of_pieces = _by_device(both, mesh, rows)(*zip(searched, known, strict=True))
+        return loss, (of_all, of_pieces)
+
+    @total.def_bwd
+    def _(gradients, change, perturbed, searched, known):
+        return jax.tree.map(lambda gradient: change * gradient, gradients)
+
+    return total
+
+
+def _by_device(function: Callable, mesh: Any, results: Any) -> Callable:
+    """Wrap `function(shared, pieces)` in `jax.shard_map`."""
+
+    def call(shared, pieces):
+        # shard_map accepts arrays only; functions and settings pass through the closure.
+        arrays, rest = eqx.partition((shared, pieces), eqx.is_array)
+        each = jax.shard_map(
+            lambda *arrays: function(*eqx.combine(arrays, rest)),
+            mesh=mesh,
+            in_specs=(jax.P(), jax.P(AXIS)),
+            out_specs=results,
+            # The check that values agree on all devices refuses loops of simulations, which start from constants.
+            check_vma=False,
+        )
+        return each(*arrays)
+
+    return call
 
 
 class Problem(eqx.Module):
@@ -72,7 +159,7 @@ def pose_problem(
     **Raises:** ValueError for logs of another system, a horizon that does not fit, logs of unequal length where segments must
     have one length, and for constraints or drives with a state in an error that does not allow them.
     """
-    system, scene = tree.given, with_sensors(tree.given).scene
+    system, scene = tree.given, build_scene(tree.given)
     if scene.constraints and (
         objective.error == "momentum" or (objective.error == "torque" and objective.observed is None)
     ):
@@ -98,15 +185,19 @@ def pose_problem(
     # The time of a Model starts at zero in every segment; that of other systems, which may depend on it, is the log's.
     bare = isinstance(system, Measured) and not (scene.forces or scene.constraints)
     restart = isinstance(scene.system if bare else system, Model) and objective.error != "closed-loop"
-    cut = partial(segments, dtype=tree.dtype, restart=restart)
+    cut = partial(cut_segments, dtype=tree.dtype, restart=restart)
     if objective.error == "torque":
         parts = [cut(log, None) for log in logs]
-        flat = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *parts)
+        has_friction = any(isinstance(force, Friction) for force in scene.forces)
+        if has_friction and not scene.constraints and any(log.cutoff is not None for log in logs):
+            changes = [np.asarray(smoothing_by_filter(scene, log)[None], tree.dtype) for log in logs]
+            parts = [dataclasses.replace(part, smoothing=x) for part, x in zip(parts, changes, strict=True)]
+        flat = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
         if not isinstance(system, Measured):
             # Without a delay samples are independent: each is a segment.
             batches = [jax.tree.map(lambda x: x[0, :, None], flat)]
         elif len({len(log) for log in logs}) == 1:
-            batches = [cut(logs, None)]
+            batches = [jax.tree.map(lambda *x: np.concatenate(x), *parts)]
         else:
             batches = parts
     else:
@@ -119,7 +210,7 @@ def pose_problem(
             objective = dataclasses.replace(objective, substeps=None, simulation=options)
         batches = [flat]
     scale = _scale(objective, scene.system, flat)
-    shared = [shard_blocks(batch, devices) for batch in batches]
+    shared = [shard_blocks(jax.tree.map(jnp.asarray, batch), devices) for batch in batches]
     return Problem(tree, objective, tuple(x for x, _ in shared), scale, tuple(mesh for _, mesh in shared)), logs
 
 
@@ -152,8 +243,8 @@ def prior_errors(problem: Problem, y) -> Float[Array, " k"]:
     return problem.prior_weight**0.5 * problem.tree.residual(y)
 
 
-def errors_of(estimate: Unknowns, problem: Problem) -> Float[Array, " n"]:
-    """All errors at a point, those of the prior after those of the data."""
+def data_errors(estimate: Unknowns, problem: Problem) -> Float[Array, " n"]:
+    """Errors of the data at a point."""
     (rest, batches), divisor, parts = _split_batches(problem), problem.divisor, []
 
     def rows(shared, pieces):
@@ -162,7 +253,12 @@ def errors_of(estimate: Unknowns, problem: Problem) -> Float[Array, " n"]:
 
     for batch, mesh in zip(batches, problem.meshes, strict=True):
         parts.append(map_by_device(rows, mesh)((rest, estimate.y), (estimate.start, batch)).reshape(-1))
-    return jnp.concatenate([*parts, prior_errors(problem, estimate.y).astype(estimate.y.dtype)])
+    return jnp.concatenate(parts)
+
+
+def errors_of(estimate: Unknowns, problem: Problem) -> Float[Array, " n"]:
+    """All errors at a point, those of the prior after those of the data."""
+    return jnp.concatenate([data_errors(estimate, problem), prior_errors(problem, estimate.y).astype(estimate.y.dtype)])
 
 
 def loss_of(estimate: Unknowns, problem: Problem) -> Float[Array, ""]:
@@ -189,18 +285,22 @@ def forward(problem: Problem) -> Problem:
     return dataclasses.replace(problem, objective=objective)
 
 
-def linearise(problem: Problem, estimate: Unknowns) -> LinearErrors:
-    """Linear errors near a point, those of the data followed by those of the prior."""
-    parts, prior = jacobians_at(problem, estimate)
-    return _assemble(problem, estimate, parts, prior)
+def linearise(problem: Problem, estimate: Unknowns, numbers: "NumbersAt | None" = None) -> LinearErrors:
+    """Linear errors near a point, those of the data followed by those of the prior; `numbers` at the point, if known."""
+    parts = jacobians_at(problem, estimate)
+    numbers = numbers_at(problem.tree, estimate.y) if numbers is None else numbers
+    return _assemble(problem, estimate, parts, numbers[2:4])
 
 
 def linearise_batch(problem: Problem, estimates: Sequence[Unknowns]) -> list[LinearErrors]:
     """Linear errors near several points, by one vectorised program."""
     stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *estimates)
-    parts, prior = jax.tree.map(np.asarray, _jacobians_of_batch(problem, stack))
+    parts, *prior = jax.tree.map(np.asarray, _jacobians_of_batch(problem, stack))
     own = [jax.tree.map(lambda x, k=k: x[k], (parts, prior)) for k in range(len(estimates))]
     return [_assemble(problem, estimate, *one) for estimate, one in zip(estimates, own, strict=True)]
+
+
+data_errors_at = eqx.filter_jit(data_errors)
 
 
 def _assemble(problem: Problem, estimate: Unknowns, parts, prior) -> LinearErrors:
@@ -217,10 +317,10 @@ def _assemble(problem: Problem, estimate: Unknowns, parts, prior) -> LinearError
 
 
 def _jacobians(problem: Problem, estimate: Unknowns):
-    """Errors and Jacobians of the data and of the prior.
+    """Errors and Jacobians of the data.
 
     For each batch errors (segments, n), their Jacobians by y (segments, n, p) and by each segment's own initial state
-    (segments, n, 2 nv) or None; then residuals (k,) of the prior and their Jacobian (k, p).
+    (segments, n, 2 nv) or None.
     """
     (rest, batches), divisor = _split_batches(forward(problem)), problem.divisor
 
@@ -242,8 +342,7 @@ def _jacobians(problem: Problem, estimate: Unknowns):
         if estimate.start is not None:
             by_y, by_start = by_unknowns[0], by_unknowns[1].reshape(*errors.shape, -1)
         parts.append((errors, by_y, by_start))
-    tree = problem.tree
-    return parts, (tree.residual(estimate.y), jax.jacfwd(tree.residual)(estimate.y))
+    return parts
 
 
 jacobians_at = eqx.filter_jit(_jacobians)
@@ -251,13 +350,32 @@ jacobians_at = eqx.filter_jit(_jacobians)
 
 @eqx.filter_jit
 def _jacobians_of_batch(problem: Problem, estimates: Unknowns):
-    return jax.vmap(partial(_jacobians, problem))(estimates)
+    tree = problem.tree
+    prior = jax.vmap(lambda y: (tree.residual(y), jax.jacfwd(tree.residual)(y)))(estimates.y)
+    return jax.vmap(partial(_jacobians, problem))(estimates), *prior
+
+
+class NumbersAt(NamedTuple):
+    """Numbers (m,) of a tree at y, their Jacobian (m, p), residuals (k,) of the prior and their Jacobian, and leaves by place."""
+
+    values: Array
+    jacobian: Array
+    residual: Array
+    prior: Array
+    leaves: dict[int, Array]
 
 
 @eqx.filter_jit
-def values_and_jacobian(tree: Parameters, y):
-    """Fitted numbers (m,) and their Jacobian (m, p) by y."""
-    return tree.values(y), jax.jacfwd(tree.values)(y)
+def numbers_at(tree: Parameters, y) -> NumbersAt:
+    """Numbers, prior, and leaves of the system at y: one program for all."""
+
+    def both(y):
+        leaves, values = apply_blocks(tree, y, "values")
+        numbers = values, tree.residual(y)
+        return numbers, (*numbers, leaves)
+
+    (jacobian, prior), (values, residual, leaves) = jax.jacfwd(both, has_aux=True)(y)
+    return NumbersAt(values, jacobian, residual, prior, leaves)
 
 
 def explain_not_finite(problem: Problem, estimate: Unknowns, logs: Sequence[Log]) -> str | None:
@@ -267,7 +385,7 @@ def explain_not_finite(problem: Problem, estimate: Unknowns, logs: Sequence[Log]
     """
     problem = on_one_device(problem)
     samples, before = segment_starts(problem, logs), 0
-    jacobians, _ = jacobians_at(problem, estimate)
+    jacobians = jacobians_at(problem, estimate)
     for batch, (_, by_y, _) in zip(problem.batches, jacobians, strict=True):
         errors = np.asarray(_errors_at(problem, batch, estimate.y, estimate.start))
         bad = ~np.isfinite(errors)
@@ -323,5 +441,5 @@ def _parameters_to_blame(problem: Problem, batch: Segments, estimate: Unknowns) 
 
 def _parameter_name(tree: Parameters, i: int) -> str:
     """Name of the number with the largest derivative by the coordinate y_i."""
-    jacobian: Any = np.asarray(values_and_jacobian(tree, tree.start)[1])[:, i]
+    jacobian: Any = np.asarray(numbers_at(tree, tree.start).jacobian)[:, i]
     return tree.names[int(np.argmax(np.abs(jacobian)))]

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.identify.logs import Log, as_logs
-from jaxdyn.identify.mechanisms import on_constraints
-from jaxdyn.identify.sensors import FitSystem
+from jaxdyn.identify.mechanisms import FitSystem, on_constraints
 from jaxdyn.identify.torque_terms import Friction
 from jaxdyn.model.arguments import Checked, Number, state_dtype
 from jaxdyn.model.tree import Model
+from jaxdyn.simulation.options import pack_steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import displace, displacement
@@ -54,17 +54,24 @@ class SampledTorque(eqx.Module):
 class Segments(eqx.Module):
     """Segments of a log, simulated in one batch; each starts on the last sample of the previous one.
 
-    Under `jax.vmap` it is one segment, without the first axis.
+    Under `jax.vmap` it is one segment, without the first axis. `smoothing`: change of the column of Coulomb friction by the
+    low-pass of the log, for errors of torques.
     """
 
-    t: Float[Array, "*segments n"]
-    q: Float[Array, "*segments n nq"]
-    v: Float[Array, "*segments n nv"]
-    tau: Float[Array, "*segments n nv"]
-    a: Float[Array, "*segments n nv"] | None = None
+    t: Float[Array | np.ndarray, "*segments n"]
+    q: Float[Array | np.ndarray, "*segments n nq"]
+    v: Float[Array | np.ndarray, "*segments n nv"]
+    tau: Float[Array | np.ndarray, "*segments n nv"]
+    a: Float[Array | np.ndarray, "*segments n nv"] | None = None
+    smoothing: Float[Array | np.ndarray, "*segments n nv"] | None = None
 
 
 def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: bool = True) -> Segments:
+    """Segments in arrays of JAX; arguments as of `cut_segments`."""
+    return jax.tree.map(jnp.asarray, cut_segments(log, horizon, dtype, restart=restart))
+
+
+def cut_segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: bool = True) -> Segments:
     """Cut a log, or each of several, into segments of `horizon` steps (None: one); remaining samples at an end are not used.
 
     Time starts at zero in each, or is that of the log (`restart=False`), for systems that depend on it.
@@ -82,7 +89,7 @@ def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: b
     if any(one.a is None for one in logs):
         logs = [dataclasses.replace(one, a=None) for one in logs]
     parts = [_segments(one, horizon, dtype, restart) for one in logs]
-    return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
 
 
 def _segments(log: Log, horizon: int | None, dtype, restart: bool) -> Segments:
@@ -103,7 +110,7 @@ def _segments(log: Log, horizon: int | None, dtype, restart: bool) -> Segments:
     t = np.asarray(log.t, np.float64)[rows]
     parts = [t - t[:, :1] if restart else t, *(np.asarray(x)[rows] for x in (log.q, log.v, log.tau))]
     parts += [] if log.a is None else [np.asarray(log.a)[rows]]
-    return Segments(*(jnp.asarray(part, dtype) for part in parts))
+    return Segments(*(np.asarray(part, dtype) for part in parts))
 
 
 def rollout(
@@ -243,9 +250,9 @@ def simulate_segment(
         state = on_constraints(scene, q0, v0, t[0], observed)
         # NaN, and no motion from a state that is not the one asked for.
         q0, v0 = (jnp.where(state.success, x, jnp.nan) for x in (state.q, state.v))
-    control = SampledTorque(t, one.tau, hold) if control is None else control
+    control = SampledTorque(t, jnp.asarray(one.tau), hold) if control is None else control
     # No exception under jax.vmap: one failed segment must not end the others.
-    motion = simulate(scene, q0, v0, t, control=control, outputs=outputs, throw=False, **given)
+    motion = simulate(scene, q0, v0, t, control=control, outputs=outputs, throw=False, **pack_steps(given))
     return motion.q, motion.v, *(getattr(motion, name) for name in outputs)
 
 

@@ -10,10 +10,9 @@ import numpy as np
 from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log, check_log
-from jaxdyn.identify.mechanisms import motor_basis
+from jaxdyn.identify.mechanisms import Measured, build_scene, motor_basis
 from jaxdyn.identify.regression import torque_error
-from jaxdyn.identify.sensors import Measured, with_sensors
-from jaxdyn.identify.torque_terms import ExtraTorque, Friction, coulomb_column, coulomb_through_filter
+from jaxdyn.identify.torque_terms import ExtraTorque, Friction, friction_of, smoothing_by_filter
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -59,7 +58,7 @@ class Fit(Outcome):
     @property
     def scene(self) -> Scene:
         """Fitted scene; of a system, its scene without constraints and forces."""
-        return with_sensors(self.system).scene
+        return build_scene(self.system)
 
     @property
     def model(self) -> Model:
@@ -69,7 +68,7 @@ class Fit(Outcome):
     @property
     def friction(self) -> Friction:
         """Fitted friction law, with its offset: a force for `Scene(fit.model, forces=[fit.friction])`."""
-        return next(force for force in self.scene.forces if isinstance(force, Friction))
+        return friction_of(self.scene)
 
     def torques(self, log: Log) -> np.ndarray:
         """Torques (n, nv) that the fitted system needs along a log, in the log's units: as its sensors would measure them.
@@ -77,14 +76,11 @@ class Fit(Outcome):
         With its friction and all extra terms (N m, N), over and above the other forces of the scene.
         """
         torque = torques_along(self.scene, log, self.motors)
+        if self.as_measured:
+            torque = torque + np.asarray(self.friction.coulomb) * smoothing_by_filter(self.scene, log)
         if isinstance(self.system, Measured):
             bias, gain = (np.asarray(x, np.float64) for x in (self.system.torque_bias, self.system.torque_gain))
             torque = (torque - bias) / gain
-        if self.as_measured:
-            v_s = float(self.friction.v_s)
-            # The scene has the unfiltered law, and the log's torque went through the low-pass: the difference corrects it.
-            change = coulomb_through_filter(log, v_s) - coulomb_column(log, v_s)
-            torque = torque + np.asarray(self.friction.coulomb) * change
         if self.extra is None:
             return torque
         # Without friction: the load of the gears is the torque of bodies and rotors, as in the fit.

@@ -24,6 +24,7 @@ from jaxdyn.identify.logs import Log, filter_like_log, refine_samples, samples_f
 from jaxdyn.model.arguments import Number, SystemLike, warn
 from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
 
 TERMS = ("viscous", "coulomb", "offset", "armature")
 # Terms that are physical only when they are not negative.
@@ -61,6 +62,20 @@ class Friction(eqx.Module):
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         return -self.torque(v)
+
+
+def friction_of(scene: Scene) -> Friction:
+    """The friction law of a scene: its first force of that kind."""
+    return next(force for force in scene.forces if isinstance(force, Friction))
+
+
+def smoothing_by_filter(scene: Scene, log: Log) -> np.ndarray:
+    """Change (n, nv) of the column of Coulomb friction by the low-pass of a log, zero for a log that was not filtered.
+
+    The log's torque went through the low-pass, and the scene has the unfiltered law.
+    """
+    v_s = float(friction_of(scene).v_s)
+    return coulomb_through_filter(log, v_s) - coulomb_column(log, v_s)
 
 
 def friction_regressor(v: Float[Array, " nv"], a: Float[Array, " nv"], terms, v_s) -> Float[Array, "nv terms_nv"]:

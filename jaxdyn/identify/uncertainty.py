@@ -10,17 +10,17 @@ for general stationary observations"; Bell & McCaffrey (2002), "Bias reduction i
 multi-stage samples", for the factor of the group left out; Priestley (1981), "Spectral analysis and time series", section 5.3.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.condensed import block_slices
 from jaxdyn.identify.logs import Log, log_rate
-from jaxdyn.identify.methods import RANK_TOLERANCE, LinearErrors
+from jaxdyn.identify.methods import RANK_TOLERANCE
 from jaxdyn.identify.options import BALANCES
 from jaxdyn.identify.problem import Problem, segment_starts
-from jaxdyn.identify.regression import least_squares_by_svd
+from jaxdyn.identify.regression import Blocks, block_slices, least_squares_by_svd
 
 # Least numbers of blocks and of independent errors in a group, where these leave at least so many groups: squares of Student's t
 # have no variance below five degrees of freedom.
@@ -206,97 +206,71 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray
     return excess <= np.sqrt(-np.log(_LEVEL) / 2 / count)
 
 
-def error_groups(problem: Problem, logs: Sequence[Log], errors: np.ndarray) -> np.ndarray:
-    """Jackknife group of each of the data's errors (n,): consecutive samples of a log, or whole logs where there are many.
+class ErrorRows(NamedTuple):
+    """Rows of the errors of a fit of parameters, `width` errors each: the block (rows,) and the log (rows,) of each.
 
-    Blocks consist of whole segments where there are enough of these, and groups of as many blocks as `block_groups` says.
+    Blocks consist of whole segments where there are enough of these.
     """
-    owners = np.array([log for log, _ in segment_starts(problem, logs)])
-    sizes = [batch.t.shape[:2] for batch in problem.batches]
-    # A unit is what a block cannot divide: a segment, or a sample of one.
-    total, units, series = sum(segments * samples for segments, samples in sizes), [], [[] for _ in logs]
-    start = segment = 0
-    for segments, samples in sizes:
-        count = len(errors) * segments * samples // total // segments
+
+    block: np.ndarray
+    log: np.ndarray
+    width: int
+
+    @classmethod
+    def of(cls, problem: Problem, logs: Sequence[Log], count: int) -> "ErrorRows":
+        """Rows of the `count` errors of a problem's data."""
+        owners = np.array([log for log, _ in segment_starts(problem, logs)])
         # A balance has one row of errors for a segment, other errors one for each sample.
-        rows = 1 if problem.objective.error in BALANCES else samples
-        for own in errors[start : start + segments * count].reshape(segments, rows, -1):
-            series[owners[segment]].append(own)
-            units.append((owners[segment], rows, own.shape[1]))
-            segment += 1
-        start += segments * count
-    whole = len(units) >= _BLOCKS
-    lengths = [sum(1 if whole else rows for owner, rows, _ in units if owner == k) for k in range(len(logs))]
-    kept = [length for length in lengths if length]
-    slices = block_slices(kept, _BLOCKS)
-    block_of_unit = np.repeat(np.arange(len(slices)), [part.stop - part.start for _, part in slices])
-    repeats = [rows * width if whole else width for _, rows, width in units for _ in range(1 if whole else rows)]
-    # The order of samples within a log is needed here: the autocorrelation is one along time.
-    size = effective_sample_size([np.concatenate(part) for part in series if part])
-    group_of_block = np.zeros(len(slices), int)
-    for number, group in enumerate(block_groups(len(slices), size)):
-        group_of_block[group] = number
-    return np.repeat(group_of_block[block_of_unit], repeats)
+        is_balance = problem.objective.error in BALANCES
+        rows = [np.full(batch.t.shape[0], 1 if is_balance else batch.t.shape[1]) for batch in problem.batches]
+        of_segment = np.concatenate(rows)
+        log = np.repeat(owners, of_segment)
+        # A unit is what a block cannot divide: a segment, or a row of one.
+        whole = len(owners) >= _BLOCKS
+        lengths = np.bincount(owners if whole else log)
+        slices = block_slices(lengths[lengths > 0].tolist(), _BLOCKS)
+        block = np.repeat(np.arange(len(slices)), [part.stop - part.start for _, part in slices])
+        return cls(np.repeat(block, of_segment) if whole else block, log, count // len(log))
+
+    def condense(self, rows: np.ndarray, errors: np.ndarray) -> Blocks:
+        """Condense errors + rows y, by blocks, to those of one torque whose columns are all shared."""
+        table, block = np.concatenate([rows, -errors[:, None]], axis=1), np.repeat(self.block, self.width)
+        edges = np.flatnonzero(np.diff(block, prepend=-1, append=block[-1] + 1))
+        tables = [table[a:b] for a, b in itertools.pairwise(edges)]
+        triangles = [[x if len(x) <= x.shape[1] else np.asarray(np.linalg.qr(x, mode="r"))] for x in tables]
+        return Blocks(triangles, rows.shape[1], 0, np.diff(edges), self.log[edges[:-1] // self.width])
+
+    def groups(self, errors: np.ndarray) -> list[np.ndarray]:
+        """Blocks of each jackknife group: consecutive ones of a log, or whole logs where there are many."""
+        # The order of samples within a log is needed here: the autocorrelation is one along time.
+        table = errors.reshape(len(self.log), self.width)
+        size = effective_sample_size([table[self.log == k] for k in np.unique(self.log)])
+        return block_groups(int(self.block[-1]) + 1, size)
 
 
-def standard_deviations(end: LinearErrors, jacobian: np.ndarray, groups: np.ndarray) -> np.ndarray:
+def standard_deviations(
+    blocks: Blocks, groups: Sequence[np.ndarray], prior: np.ndarray, jacobian: np.ndarray, used: int = 0
+) -> np.ndarray:
     """Standard deviations (m,) of numbers with the Jacobian (m, p) by y; infinite where neither data nor prior determine them.
 
     The larger of two: that of independent errors of equal size, and that of a jackknife over groups, which accounts for errors
     that are autocorrelated, correlated among coordinates, and larger at some samples. A few groups estimate a deviation
     badly, and a number that a single group determines has no scatter over groups; the other one is then a lower bound. Errors
-    of the prior have the size that it states. NaN when the errors are not finite, or no more than the unknowns.
+    of the data have one size, which is estimated from them; errors of the prior, with the rows `prior` (k, p), have the size
+    that it states. `used`: errors that other unknowns have used up. NaN where errors are no more than the unknowns.
 
     Source: Bell & McCaffrey (2002), CR3; Angrist & Pischke (2009), "Mostly harmless econometrics", section 8.2, the maximum.
     """
-    white = whiten_errors(end, jacobian)
-    if white is None:
+    ones, count = np.ones(1), blocks.count() - used
+    whole = np.asarray(np.linalg.qr(blocks.rows(ones), mode="r"))
+    data = whole[:, :-1]
+    if len(prior) == 0:
+        count -= least_squares_by_svd(data, np.zeros(len(data)), RANK_TOLERANCE).rank
+    if count <= 0:
         return np.full(len(jacobian), np.nan)
-    # In whitened coordinates the covariance for independent errors is the identity.
-    independent = np.sum(white.numbers**2, axis=1)
-    curvature = white.prior.T @ white.prior
-    parts = [(white.data[groups == k], white.errors[groups == k]) for k in range(groups.max(initial=0) + 1)]
-    grams = np.stack([part.T @ part for part, _ in parts])
-    root = jackknife(grams, np.stack([part.T @ error for part, error in parts]), curvature).root
-    # Errors of the prior have the size that it states: their part needs no estimate from scatter.
-    variance = np.sum((white.numbers @ root) ** 2, axis=1) + np.sum((white.numbers @ white.prior.T) ** 2, axis=1)
-    return np.where(white.is_free, np.inf, np.sqrt(np.maximum(variance, independent)))
-
-
-class WhitenedErrors(NamedTuple):
-    """Errors near a minimum in coordinates in which data and prior together have the curvature 1.
-
-    `data` (n, r), `errors` (n,): rows and errors of the data over their deviation; `prior` (k, r): rows of the prior; `numbers`
-    (m, r): derivatives of the fitted numbers; `is_free` (m,): which of these neither data nor prior determine.
-    """
-
-    data: np.ndarray
-    errors: np.ndarray
-    prior: np.ndarray
-    numbers: np.ndarray
-    is_free: np.ndarray
-
-
-def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | None:
-    """Whitened errors, for numbers with the Jacobian (m, p) by y; None if not finite, or no more errors than unknowns.
-
-    Errors of the data have one size, which is estimated from them; those of the prior have the size that it states.
-    """
-    if not end.is_finite:
-        return None
-    count = len(end.errors) - end.priors
-    data = end.rows[:count]
-    # Initial states were eliminated; each of their directions has used up one error.
-    spare = count - end.start_rank
-    if end.priors == 0:
-        triangle = np.linalg.qr(data, mode="r")
-        spare -= least_squares_by_svd(triangle, np.zeros(len(triangle)), RANK_TOLERANCE).rank
-    if spare <= 0:
-        return None
     # The estimated variance of errors; for errors that are all zero the smallest number keeps the division defined.
-    noise = (max(float(np.sum(end.errors[:count] ** 2)), 1e-300) / spare) ** 0.5
-    # The prior's rows were weighted by an assumed noise: here by the estimated one.
-    rows = np.concatenate([data / noise, end.rows[count:] / end.prior_weight**0.5])
+    noise = (max(float(np.sum(whole[:, -1] ** 2)), 1e-300) / count) ** 0.5
+    rows = np.concatenate([data / noise, prior])
     # Columns of unit length: ranks must not depend on units of the parameters.
     size = np.linalg.norm(rows, axis=0)
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
@@ -310,6 +284,13 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
     # A number with any share in the null space of data and prior is not determined.
     is_free = np.linalg.norm(seen @ Vt[rank:].T, axis=1) > 1e-6 * np.linalg.norm(seen, axis=1)
     is_free |= np.abs(scaled[:, unseen]).sum(axis=1) > 0
-    whitening = Vt[:rank].T / s[:rank]
-    rows = (rows / size) @ whitening
-    return WhitenedErrors(rows[:count], end.errors[:count] / noise, rows[count:], seen @ whitening, is_free)
+    # In whitened coordinates data and prior together have the curvature 1: the covariance for independent errors is the identity.
+    whitening = Vt[:rank].T / s[:rank] / size[:, None]
+    numbers, prior = seen @ (Vt[:rank].T / s[:rank]), prior @ whitening
+    parts = [np.concatenate([blocks.triangles[k][0] for k in group]) / noise for group in groups]
+    parts = [(part[:, :-1] @ whitening, -part[:, -1]) for part in parts]
+    grams = np.stack([part.T @ part for part, _ in parts])
+    root = jackknife(grams, np.stack([part.T @ error for part, error in parts]), prior.T @ prior).root
+    # Errors of the prior have the size that it states: their part needs no estimate from scatter.
+    variance = np.sum((numbers @ root) ** 2, axis=1) + np.sum((numbers @ prior.T) ** 2, axis=1)
+    return np.where(is_free, np.inf, np.sqrt(np.maximum(variance, np.sum(numbers**2, axis=1))))

@@ -5,17 +5,16 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from typing import Any as _Any
 
 from jaxdyn.io.formats import load as load
+from jaxdyn.io.formats import load_model as load_model
 from jaxdyn.io.loaded import Actuators as Actuators
 from jaxdyn.io.loaded import LoadedScene as LoadedScene
 from jaxdyn.io.loaded import NotTakenWarning as NotTakenWarning
 from jaxdyn.io.loaded import Start as Start
 from jaxdyn.io.loaded import UnitsWarning as UnitsWarning
-from jaxdyn.io.mjcf import load_mjcf as load_mjcf
-from jaxdyn.io.sdf import load_sdf as load_sdf
-from jaxdyn.io.urdf import load_urdf as load_urdf
 from jaxdyn.io.urdf import urdf_inertia_report as urdf_inertia_report
 from jaxdyn.io.urdf_write import read_torque_terms as read_torque_terms
 from jaxdyn.io.urdf_write import save_urdf as save_urdf
+from jaxdyn.model.arguments import deprecated as _deprecated
 
 if _TYPE_CHECKING:
     from jaxdyn.io.logs import read_log as read_log
@@ -28,6 +27,9 @@ def __getattr__(name: str) -> _Any:
         from jaxdyn.io import logs
 
         return getattr(logs, name)
+    # Deprecated names, which warn when they are called.
+    if name in ("load_mjcf", "load_sdf", "load_urdf"):
+        return _deprecated(f"jd.io.{name}", load_model if name == "load_urdf" else load)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxdyn.identify.log_repair import repair_log
 from jaxdyn.identify.logs import Log
-from jaxdyn.identify.workflows.log_repair import repair_log
 from jaxdyn.model.arguments import Checked, FilePath, as_path, parse_number
 from jaxdyn.model.tree import Model
 

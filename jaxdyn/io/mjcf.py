@@ -13,12 +13,20 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.contact.height_field import HeightField
+from jaxdyn.contact.shape_contacts import HeightField
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
-from jaxdyn.io.chains import Link, Names, add_chain, build_model
-from jaxdyn.io.collisions import Collision, check_choice, contacts_with_ground
-from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
+from jaxdyn.io.loaded import (
+    Link,
+    LoadedScene,
+    Names,
+    Start,
+    add_chain,
+    build_model,
+    summarize,
+    warn_not_taken,
+    warn_of_units,
+)
 from jaxdyn.io.mjcf_file import (
     BALL,
     FREE,
@@ -33,12 +41,12 @@ from jaxdyn.io.mjcf_file import (
     sensors,
 )
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
-from jaxdyn.io.solids import geom_solid
+from jaxdyn.io.solids import Collision, contacts_with_ground, geom_solid
 from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import Checked, DType, as_path
+from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.joints import joint_neutral
+from jaxdyn.model.configuration import neutral
 from jaxdyn.model.tree import Model
 
 _HEIGHT_FIELD = 1  # mjtGeom
@@ -108,49 +116,16 @@ def _height_field(m, g: int) -> HeightField:
     return HeightField(heights * float(m.hfield_size[i, 2]), 2 * half / (np.array([columns, rows]) - 1))
 
 
-def load_mjcf(
-    path: str | os.PathLike, *, contacts: Checked[str | Iterable[str] | None] = None, dtype: DType | None = None
-) -> LoadedScene:
-    """Load the scene of an MJCF file (MuJoCo's XML), compiled by the mujoco package.
+def read_mjcf(path: str | os.PathLike, *, contacts, dtype: DType | None) -> LoadedScene:
+    """Scene of an MJCF file, with options as of `jd.load`.
 
-    Supported are bodies with their inertias, joints (hinge, slide, ball, free; several on one body become a chain of
-    massless bodies BODY_JOINT), armature, limits (as the model's `lower`, `upper`), damping, springs and dry friction
-    of joints, gravity; `equality` of kind connect, weld, joint and tendon as exact constraints, where MuJoCo softens
-    them; tendons that are linear in the joints' coordinates; actuators, also with an integrator or a filter; sites as frames;
-    keyframes as starts; sensors of frames, joints, force and torque. Every body keeps its frame of the file under its
-    name. Missing names
-    become "bodyN" and BODY_joint (BODY_jointK of several), names in use get an underscore appended, and a site with
-    the name of a body is SITE_site.
-
-    `load_urdf` returns a `Model`, since a URDF describes only a tree; `load_mjcf` and `load_sdf` return a
-    `LoadedScene`, a `Scene` with that model as `.system`.
-
-    Coordinates: hinge and slide have MuJoCo's numbers; ball and free joints have MuJoCo's configuration (a free body's q
-    is its pose in the world), and velocities in body axes. Joints stand depth-first, siblings by name, as everywhere.
-
-    **Arguments:**
-
-    - `path`: the file.
-    - `contacts`: "ground" for contacts of the collision geoms of all bodies with the planes and height fields that are fixed to
-      the world (with the plane z = 0 where there are none), or a list of the bodies that touch it, as for `jd.load`. Bits
-      (contype, conaffinity), pairs and exclusions of the file decide which of them touch; the coefficient of friction is the
-      larger one, that of the higher priority, or that of the pair, and zero for condim 1. Softness is not read. None: none.
-    - `dtype`: as for `ModelBuilder`.
-
-    **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
-    0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is MuJoCo's qpos0), `.actuators`, `.sensors` (a tuple for
-    `jd.sensors.measure`), `.not_taken`.
-
-    **Warns:** `NotTakenWarning` naming unsupported elements: contact geometry without contacts, muscles, DC motors and
-    user-defined actuators, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and more.
-
-    `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
+    Missing names become "bodyN" and BODY_joint (BODY_jointK of several), names in use get an underscore appended, and a site with
+    the name of a body is SITE_site. Several joints on one body become a chain of massless bodies BODY_JOINT.
 
     **Raises:** ValueError with the file (and the line, where mujoco gives it) for a file that cannot be read or
     compiled; for a joint that moves no inertia. ImportError without mujoco.
     """
     mujoco = import_mujoco()
-    contacts = check_choice(contacts)
     given = str(as_path(path))
     m, missing = compile_file(mujoco, given)
     file = assign_names(mujoco, m, given)
@@ -295,7 +270,7 @@ def _starts(file: CompiledFile, model: Model, drives) -> dict[str, Start]:
 def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np.ndarray]:
     """Convert MuJoCo's state to the model's coordinates."""
     m = file.m
-    q = np.concatenate([np.zeros(0), *(joint_neutral(kind) for kind in model.topology.kinds)])
+    q = np.array(neutral(model), float)
     v = np.zeros(model.nv)
     for j, name in enumerate(file.joints):
         i = model.joint_names.index(name)

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.dynamics.kinematics import named_frame
-from jaxdyn.io.chains import Names
-from jaxdyn.io.loaded import summarize
+from jaxdyn.io.loaded import Names, summarize
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.tree import Model
@@ -65,7 +64,7 @@ def compile_file(mujoco, path: str):
     if file.root.tag != "mujoco":
         raise file.fault(
             file.root,
-            f"the root element is <{file.root.tag}>, expected <mujoco>; load_urdf and load_sdf read those formats",
+            f"the root element is <{file.root.tag}>, expected <mujoco>; jd.load reads all formats",
         )
     if not file.is_utf8:
         raise ValueError(f"{path}:1: mujoco reads files in UTF-8 alone; save the file as UTF-8")

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,19 +10,27 @@ import numpy as np
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
-from jaxdyn.io.chains import Link, Names, add_chain, build_model
-from jaxdyn.io.collisions import FRICTION, check_choice, collision_of, contacts_with_ground
-from jaxdyn.io.loaded import LoadedScene, Start, summarize, summarize_all, warn_not_taken, warn_of_units
-from jaxdyn.io.sdf_frames import SdfFile
-from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
-from jaxdyn.io.solids import sdf_elements
+from jaxdyn.io.loaded import (
+    Link,
+    LoadedScene,
+    Names,
+    Start,
+    add_chain,
+    build_model,
+    summarize,
+    summarize_all,
+    warn_not_taken,
+    warn_of_units,
+)
+from jaxdyn.io.sdf_file import LOOPS, Axis, Joint, SdfFile, inertia_of, read_joints
+from jaxdyn.io.solids import FRICTION, collision_of, contacts_with_ground, sdf_elements
 from jaxdyn.io.unread import SDF_FRAME, SDF_JOINT, SDF_LINK, SDF_MODEL, SDF_ROOT, SDF_WORLD, unread_parts
 from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.io.xml_lines import rounding_of_digits
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import Checked, DType
+from jaxdyn.model.arguments import DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
-from jaxdyn.model.joints import joint_neutral
+from jaxdyn.model.configuration import neutral
 from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
 
@@ -32,56 +41,19 @@ _PARALLEL = 1e-4  # files give right angles with four or five digits
 _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
 
 
-def load_sdf(
-    path: str | os.PathLike,
-    *,
-    floating_base: bool = True,
-    contacts: Checked[str | Iterable[str] | None] = None,
-    dtype: DType | None = None,
-) -> LoadedScene:
-    """Load the scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
+def read_sdf(path: str | os.PathLike, *, floating_base: bool, contacts, dtype: DType | None) -> LoadedScene:
+    """Scene of an SDF file, with options as of `jd.load`.
 
-    Supported are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the
-    model's `lower`, `upper`), damping, dry friction and springs of joints, gearboxes and mimicked axes as couplings,
-    frames, nested models (their names start with MODEL::), static models, and the world's gravity. A joint that closes a
-    loop becomes a constraint; the choice keeps coordinates for springs, damping and limits, and cuts ball joints
-    first (`jaxdyn.io.sdf_joints.spanning_tree`). Defaults of the format apply: a link without
-    <inertial> has 1 kg and 1 kg m^2 about each axis.
-
-    `load_urdf` returns a `Model`, since a URDF describes only a tree; `load_mjcf` and `load_sdf` return a
-    `LoadedScene`, a `Scene` with that model as `.system`.
-
-    Coordinates: zero is the placement of the file; a positive angle rotates the child relative to the parent about the axis,
-    also where the tree runs from child to parent. The coordinates of a free root (joint "root_joint", or LINK_root_joint
-    of several) are its link's pose in the world. Every link keeps a frame of its name.
-
-    **Arguments:**
-
-    - `path`: the file.
-    - `floating_base`: whether parts without a joint to the world move freely, the default of the format; False fixes the root
-      links at the file's placement. The root of a part is its model's canonical link.
-    - `contacts`: "ground" for contacts of the collisions of all links with the planes of static models (with the plane z = 0
-      where there are none), or a list of the links that touch it, as for `jd.load`. The coefficient of friction is the smaller
-      `<mu>` in `<surface><friction><ode>` of both, by default 1, as Gazebo takes it. None: no contacts.
-    - `dtype`: as for `ModelBuilder`.
-
-    **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
-    0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is the placement of the file, on which all loops close),
-    `.actuators` (None), `.not_taken`. Gravity is that of the file's world (its default is 9.8 m/s^2), 9.81 m/s^2
-    downwards where the file has no world.
-
-    **Warns:** `NotTakenWarning` naming unsupported elements: collisions without contacts, sensors, plugins, includes, screws that
-    close loops, springs and damping of joints that close loops, and the like.
-
-    Elements and attributes that the format does not have are named too.
-
-    `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
+    A joint that closes a loop becomes a constraint; the choice keeps coordinates for springs, damping and limits, and cuts ball
+    joints first (`spanning_tree`). Two axes of one joint are two joints, JOINT and JOINT_axis2; names in nested models start with
+    MODEL::.
+    A positive angle rotates the child relative to the parent about the axis, also where the tree runs from child to parent. Free
+    roots have the joint "root_joint", or LINK_root_joint of several; the root of a part is its model's canonical link.
 
     **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, entity declarations,
     another version, unknown names or types, reserved names, a part that is given twice, cyclic poses, bad numbers, an inertia
     that is to be computed from shapes, or whose pose is relative to another frame; for a joint that moves no inertia.
     """
-    contacts = check_choice(contacts)
     file = SdfFile(path)
     joints = read_joints(file)
     # A gearbox couples two other joints; as an edge of the graph it would close a loop that does not exist.
@@ -102,6 +74,93 @@ def load_sdf(
     starts = {"reference": _start(file, model, roots)}
     forces = [*_forces(model, tree), *touching]
     return LoadedScene(model, [*loops, *couplings], forces, starts=starts, not_taken=not_taken)
+
+
+class Edge(NamedTuple):
+    """Edge of the tree: `body` is attached to `carrier` by `joint`, backwards where `body` is the joint's parent in the file."""
+
+    joint: Joint | None  # None: the body is a root without a joint in the file
+    carrier: str | None
+    body: str
+    backwards: bool
+
+
+def spanning_tree(
+    links: Iterable[str], fixed: Iterable[str], joints: list[Joint], first: Iterable[str]
+) -> tuple[list[Edge], list[Joint]]:
+    """Choose the joints of the tree, parents before children; the remaining joints close loops.
+
+    A joint that closes a loop has no coordinate, so its spring, damping and limits are lost. The tree prefers
+    joints with a spring, then with damping or friction, then with limits; ball joints, and joints marked
+    to be cut, come last; ties are broken by depth from the root in breadth-first order, then by the file's order.
+
+    **Arguments:** `links`; `fixed`, links that do not move; `joints` without gearboxes; `first`, links preferred as
+    roots of parts without a joint to the world, in order of preference.
+    """
+    # The arguments are read several times and may be iterators.
+    links, fixed, first = list(links), set(fixed), list(first)
+    # The world is a node, so that all joints to it are edges like others.
+    nodes: list[str | None] = [None, *links]
+    near: dict[str | None, list[str | None]] = {node: [] for node in nodes}
+    for joint in joints:
+        near[joint.parent].append(joint.child)
+        near[joint.child].append(joint.parent)
+    # Links of static models are at depth 1 although no joint holds them.
+    for link in fixed:
+        near[None].append(link)
+    depth: dict[str | None, int] = {}
+    roots: list[str | None] = []
+    # Breadth first from the world, then from each preferred root of a part not reached yet.
+    for start in (None, *first, *links):
+        if start in depth:
+            continue
+        roots.append(start)
+        depth[start], queue = 0, [start]
+        for node in queue:
+            for other in near[node]:
+                if other not in depth:
+                    depth[other] = depth[node] + 1
+                    queue.append(other)
+
+    def cost(joint: Joint):
+        leaves = [axis.leaves for axis in joint.axes]
+        moving = any("damping" in leaf or "friction" in leaf for leaf in leaves)
+        springs, limits = any(axis.stiffness for axis in joint.axes), any(axis.limited for axis in joint.axes)
+        # Of equal joints the one nearer to the root stays, which gives short branches.
+        deep = min(depth[joint.parent], depth[joint.child])
+        return joint.cut, joint.kind == "ball", not springs, not moving, not limits, deep
+
+    # Kruskal's algorithm: adding the cheapest joint between two parts gives the tree of least total cost.
+    part: dict[str | None, str | None] = {node: node for node in nodes} | dict.fromkeys(fixed, None)
+
+    def group(node: str | None) -> str | None:
+        while part[node] != node:
+            node = part[node]
+        return node
+
+    chosen: list[Joint] = []
+    left: set[str] = set()
+    for joint in sorted(joints, key=cost):
+        a, b = group(joint.parent), group(joint.child)
+        if a == b:
+            left.add(joint.name)
+            continue
+        chosen.append(joint)
+        # The world represents its own group, since it can never be merged into another.
+        part[b if a is None else a] = a if a is None else b
+    # Directions follow from the roots outwards, whatever parent and child are in the file.
+    edges: list[Edge] = [Edge(None, None, link, False) for link in links if link in fixed]
+    edges += [Edge(None, None, root, False) for root in roots if root is not None]
+    seen: set[str | None] = {None, *(edge.body for edge in edges)}
+    queue = [None, *(edge.body for edge in edges)]
+    for node in queue:
+        for joint in chosen:
+            for here, there, backwards in ((joint.parent, joint.child, False), (joint.child, joint.parent, True)):
+                if here == node and there is not None and there not in seen:
+                    seen.add(there)
+                    queue.append(there)
+                    edges.append(Edge(joint, node, there, backwards))
+    return edges, [joint for joint in joints if joint.name in left]
 
 
 def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, dtype) -> tuple[Model, dict[str, str]]:
@@ -131,7 +190,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
     free = [edge.body for edge in edges if edge.joint is None and edge.body not in static and floating]
     roots: dict[str, str] = {}
     for edge in edges:
-        inertia = _inertia(file, edge.body)
+        inertia = inertia_of(file, edge.body)
         place = file.pose(edge.body)
         links: list[Link] = []
         if edge.joint is not None:
@@ -181,40 +240,6 @@ def _links(edge: Edge, place: np.ndarray) -> list[Link]:
         links.append(Link(name, word, direction, anchor, 0.0, axis.leaves, joint.pitch))
     # Two-axis joints reverse their order as well as their sign.
     return links[::-1] if edge.backwards else links
-
-
-def _inertia(file: SdfFile, link: str) -> np.ndarray:
-    element, what = file.links[link][0], f"link {link!r}"
-    inertial = element.find("inertial")
-    if inertial is None:
-        # The format's default inertial: 1 kg and the unit matrix.
-        return np.asarray(host_math.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what))
-    # Version 1.11 of the format computes inertias from shapes where this attribute is set.
-    if (inertial.get("auto") or "").strip().lower() in ("1", "true"):
-        raise file.fault(
-            inertial,
-            f"the inertia of {what} is to be computed from its shapes, which is not supported; write <mass> "
-            "and <inertia> (`gz sdf --inertial-stats FILE` prints them)",
-        )
-    get = lambda tag, default: file.number(inertial, f"inertia/{tag}", default, what)  # noqa: E731
-    # Each missing entry has a default of its own, also in an <inertia> that gives others.
-    xx, yy, zz = get("ixx", 1.0), get("iyy", 1.0), get("izz", 1.0)
-    xy, xz, yz = get("ixy", 0.0), get("ixz", 0.0), get("iyz", 0.0)
-    mass = file.number(inertial, "mass", 1.0, what)
-    pose = inertial.find("pose")
-    # The format has no frames here; a file that names one means another centre of mass than it says.
-    if pose is not None and (named := pose.get("relative_to")):
-        raise file.fault(
-            pose,
-            f"<pose> of <inertial> of {what} is relative to {named!r}; give it in the link's frame, without relative_to",
-        )
-    try:
-        about_com = (mass, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        return np.asarray(
-            host_math.move_inertia(file.raw_pose(inertial, what), host_math.inertia_numbers(about_com, what))
-        )
-    except ValueError as error:
-        raise error if str(error).startswith(file.path) else file.fault(inertial, str(error)) from error
 
 
 def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constraint], list[str]]:
@@ -327,8 +352,7 @@ def _forces(model: Model, tree: dict[str, Joint]) -> list:
 
 def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
     """Start at the placement of the file."""
-    # Zero coordinates are the file's placement; quaternions need their 1.
-    q = np.concatenate([np.zeros(0), *(joint_neutral(kind) for kind in model.topology.kinds)])
+    q = np.array(neutral(model), float)
     for joint, link in roots.items():
         pose = file.pose(link)
         q[model.topology.q_slices[model.joint_names.index(joint)]] = np.concatenate(

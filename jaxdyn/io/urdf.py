@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.io.loaded import warn_not_taken, warn_of_units
-from jaxdyn.io.urdf_parts import JOINTS, Inertial, Joint, Mimic, elements_without_effect, read_parts
+from jaxdyn.io.loaded import warn_of_units
+from jaxdyn.io.urdf_parts import JOINTS, Inertial, Joint, Mimic, read_parts
 from jaxdyn.io.xml_lines import XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers
-from jaxdyn.model.builder import GRAVITY, ModelBuilder, unknown
+from jaxdyn.model.builder import ModelBuilder, unknown
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model, inertia_problems
 
@@ -35,77 +35,24 @@ class _Description(NamedTuple):
     root: str
 
 
-def load_urdf(
-    path: str | os.PathLike,
-    *,
-    floating_base: bool = False,
-    lock: Iterable[str] | Mapping[str, Any] = (),
-    mimic: str = "ignore",
-    gravity: Numbers = GRAVITY,
-    missing_inertia: Numbers | None = None,
-    arguments: Mapping[str, Any] | None = None,
-    packages: Mapping[str, str | os.PathLike] | None = None,
-    dtype: DType | None = None,
-) -> Model:
-    """Load the mechanism of a URDF file, or of a xacro file that expands to one. Meshes are not read.
-
-    Links joined by fixed joints are merged; every link keeps a frame of its name. Joints are in Pinocchio's order.
-    The inertias are those of the file, physical or not (`urdf_inertia_report`, `repair_inertias`). `damping` and
-    `friction` of `<dynamics>` become leaves; so does `armature`, the rotor inertia seen at the joint, an attribute that
-    is an extension of URDF that `save_urdf` writes. A planar joint moves in the plane normal to its axis, as URDF defines it
-    (Pinocchio moves it in the x-y plane of its frame whatever the axis); where that axis is not z, the moving body is
-    called LINK_plane, has its z along the axis, and carries LINK.
-
-    **Arguments:**
-
-    - `path`: the file.
-    - `floating_base`: whether the root link moves freely, by a first joint "root_joint"; else it is fixed to the world.
-    - `lock`: joints to lock, at neutral (names) or at given coordinates (name -> number or (nq of the joint,)).
-      They become fixed and their links are merged.
-    - `mimic`: treatment of mimic joints. "ignore" leaves them free, "couple" leaves them free and
-      records the couplings for a scene to impose (and locks those that follow a locked or a fixed joint, the latter at their
-      offset), "error" refuses them.
-    - `missing_inertia`: the inertia of links that a joint moves and that have none, as `inertia` of `ModelBuilder.add_body`:
-      `jd.inertia.sphere(1.0, 0.1)` loads an arm without inertias for kinematics. None: they are massless.
-    - `arguments`: of the `<xacro:arg>` elements of a file that ends in .xacro, which the package xacro expands.
-    - `packages`: folders of packages that such a file names by `$(find NAME)`, by name. Those beside the file or above it, and
-      those of an installed ROS, are found without.
-    - `gravity`, `dtype`: as for `ModelBuilder`.
-
-    **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, links that are not a tree,
-    an unknown joint type, a bad number, a part that is given twice, a declared entity, a negative mass, a negative limit of
-    velocity or effort, a zero axis; for names in `lock` that are not movable joints;
-    for a joint that moves no inertia. ImportError for a xacro file without the package xacro.
-
-    **Warns:** `NotTakenWarning` naming elements and attributes that are not read, as `jd.load` does (its `not_taken` is the
-    list); UserWarning naming the links with an unphysical inertia; `UnitsWarning` where limits look like degrees,
-    or lengths and inertias like millimetres.
-    """
-    file = XmlFile(path, "URDF", arguments, packages)
-    options: dict[str, Any] = {"gravity": gravity, "dtype": dtype, "missing_inertia": missing_inertia}
-    model = urdf_model(file, floating_base=floating_base, lock=lock, mimic=mimic, **options)
-    warn_not_taken(file.path, elements_without_effect(file))
-    return model
-
-
 def urdf_model(
     file: XmlFile,
     *,
-    floating_base: bool,
+    floating_base: bool | None,
     lock: Iterable[str] | Mapping[str, Any],
     mimic: str,
-    gravity,
-    dtype,
+    gravity: Numbers | None,
+    missing_inertia: Numbers | None,
+    dtype: DType | None,
     balls: Iterable[str] = (),
     followers: Mapping[str, tuple[Mimic, str]] | None = None,
-    missing_inertia: Numbers | None = None,
 ) -> Model:
-    """Build the model of a URDF file, with options as of `load_urdf`.
+    """Build the model of a URDF file, with options as of `jd.load_model`.
 
     `balls` names spherical joints, a kind that URDF lacks; `followers` are joints that follow others without `<mimic>`, each
     with file:line.
 
-    **Raises:** as `load_urdf`; ValueError for balls that are no movable joints of the file.
+    **Raises:** as `jd.load_model`; ValueError for balls that are no movable joints of the file.
     """
     if mimic not in ("ignore", "couple", "error"):
         raise ValueError(f"mimic is {mimic!r}; give 'ignore', 'couple' or 'error'")
@@ -183,9 +130,9 @@ def urdf_inertia_report(
     """Unphysical inertias stated in a URDF file, as (link, problem), before links are merged.
 
     Links without `<inertial>` are listed only where a joint moves them: a fixed one is only a frame. `arguments` and
-    `packages` are as for `load_urdf`.
+    `packages` are as for `jd.load_model`.
 
-    **Raises:** ValueError as `load_urdf` does for a file that cannot be read.
+    **Raises:** ValueError as `jd.load_model` does for a file that cannot be read.
     """
     urdf = _read(XmlFile(path, "URDF", arguments, packages))
     # A massless link on a fixed joint is a frame, as of a tool or a sensor.

@@ -22,7 +22,7 @@ import numpy as np
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import loop
 from jaxdyn.io.loaded import Actuators, summarize, summarize_all
-from jaxdyn.io.sdf_joints import LOOPS
+from jaxdyn.io.sdf_file import LOOPS
 from jaxdyn.io.urdf_parts import Mimic
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math

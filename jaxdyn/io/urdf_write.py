@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxdyn.io.loaded import Names
 from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
@@ -56,7 +57,7 @@ class _Edge(NamedTuple):
 def save_urdf(
     model: Model, path: str | os.PathLike, *, torques: Mapping[str, Mapping[str, float]] | None = None
 ) -> None:
-    """Write a model as a URDF file; `load_urdf` returns the same model, to rounding.
+    """Write a model as a URDF file; `load_model` returns the same model, to rounding.
 
     Bodies become links, other frames become links on fixed joints; merged links stay merged. A single root body on
     a free joint "root_joint" becomes the root link (load it with `floating_base=True`); otherwise the root is a frame
@@ -127,7 +128,7 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
     """Root link, and joints whose depth-first order with siblings sorted by name is the model's order."""
     topology = model.topology
     home, poses = np.asarray(model.home, np.float64), np.asarray(model.frame_poses, np.float64)
-    links, joints = set(topology.frame_names), set(topology.joint_names)
+    links, joints = Names(topology.frame_names), Names(topology.joint_names)
     children: dict[int, list[int]] = {i: [] for i in range(-1, model.nb)}
     frames: dict[int, list[int]] = {i: [] for i in range(-1, model.nb)}
     for i, parent in enumerate(topology.parents):
@@ -141,7 +142,7 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
     else:
         # A frame at the world's origin can be the root link; otherwise one is added.
         at_world = [k for k in frames[-1] if np.array_equal(poses[k], np.eye(4))]
-        names[-1] = topology.frame_names[at_world[0]] if at_world else _fresh("world", links)
+        names[-1] = topology.frame_names[at_world[0]] if at_world else links.new("world")
         frames[-1] = [k for k in frames[-1] if k not in at_world[:1]]
 
     edges = []
@@ -152,12 +153,10 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
         holders = [(name, np.eye(4))]
         for n in range(max(len(frames[carrier]), len(runs) - 1)):
             k = frames[carrier][n] if n < len(frames[carrier]) else None
-            link, pose = (
-                (_fresh(f"{name}_carrier", links), np.eye(4)) if k is None else (topology.frame_names[k], poses[k])
-            )
+            link, pose = (links.new(f"{name}_carrier"), np.eye(4)) if k is None else (topology.frame_names[k], poses[k])
             # Bodies on a holder are visited with the holder's joint, after all joints with smaller names.
             joint = f"{last}~{n:03d}" if n + 1 < len(runs) else f"{link}_fixed"
-            edges.append(_Edge(_fresh(joint, joints), name, link, pose, None))
+            edges.append(_Edge(joints.new(joint), name, link, pose, None))
             holders.append((link, pose))
         for (link, pose), run in zip(holders, runs, strict=False):
             for i in (topology.joint_names.index(joint) for joint in run):
@@ -188,14 +187,6 @@ def _split_runs(names: list[str]) -> list[list[str]]:
         else:
             runs.append([name])
     return runs
-
-
-def _fresh(name: str, taken: set[str]) -> str:
-    """Reserve a name, with underscores appended until it is unique."""
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
 
 
 def _write_link(robot: ET.Element, name: str, parameters: np.ndarray | None) -> None:

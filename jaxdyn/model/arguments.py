@@ -78,6 +78,15 @@ def as_array(value: Any, name: str, dtype=None) -> Given:
     return jnp.asarray(_cast(value, dtype) if isinstance(value, np.ndarray) else value, dtype)
 
 
+def as_shape(value: Any, name: str, dtype, *shapes: tuple[int, ...], of: str = "") -> Given:
+    """`as_array` of one of some shapes. **Raises:** ValueError for another one, with what the numbers are `of`."""
+    value = as_array(value, name, dtype)
+    if value.shape not in shapes:
+        wanted = " or ".join(map(str, shapes))
+        raise ValueError(f"{name} has shape {value.shape}, expected {wanted}{of}{batch_hint(value, shapes[0])}")
+    return value
+
+
 def as_operand(value: Any, name: str, dtype) -> Given:
     """`as_array`; of numpy outside of a trace, where each operation of JAX is a program of its own."""
     value = as_array(value, name)

@@ -206,11 +206,6 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     return quat if quat[0] >= 0 else -quat
 
 
-def motion_subspace(kind: str, screw: np.ndarray) -> np.ndarray:
-    """Motion subspace of `joints.motion_subspace` in float64, (6, nv of the joint)."""
-    return screw[:, None] if kind in SCREW_KINDS else np.eye(6)[:, KINDS[kind].columns]
-
-
 def inertia_numbers(inertia, what: str) -> Values:
     """Ten inertial parameters from None (massless), (10,), or (mass, com, inertia about the com).
 
@@ -331,7 +326,8 @@ def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool
     # From the leaves to the root, as in the articulated-body algorithm: a child's inertia is complete before its
     # parent's.
     for i in reversed(range(topology.nb)):
-        S = motion_subspace(topology.kinds[i], screws[i])
+        kind = topology.kinds[i]
+        S = screws[i][:, None] if kind in SCREW_KINDS else np.eye(6)[:, KINDS[kind].columns]
         rotor = np.zeros(S.shape[1]) if armature is None else armature[topology.v_slices[i]]
         whole = np.diag(S.T @ composite[i] @ S) + rotor
         D = S.T @ articulated[i] @ S + np.diag(rotor)
@@ -350,7 +346,7 @@ def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool
         if (parent := topology.parents[i]) >= 0:
             # A joint already found idle passes its full inertia on, as if locked; the test of its parents stays
             # independent of it.
-            X = adjoint(inverse(home[i] @ joint_pose(topology.kinds[i], screws[i], q[i])))
+            X = adjoint(inverse(home[i] @ joint_pose(kind, screws[i], q[i])))
             composite[parent] += X.T @ composite[i] @ X
             articulated[parent] += X.T @ carried @ X
     return idle

@@ -47,7 +47,6 @@ def join(
     for argument, model in (("left", left), ("right", right)):
         if not isinstance(model, Model):
             raise ValueError(f"{argument} is a {type(model).__name__}; pass a Model")
-        _check_plain(model)
     prefixes = ("", prefix) if isinstance(prefix, str) else prefix
     if not isinstance(prefixes, (tuple, list)) or len(prefixes) != 2 or not all(isinstance(x, str) for x in prefixes):
         raise ValueError(f"prefix is {prefix!r}; give a string for the right model, or one for each")
@@ -56,12 +55,6 @@ def join(
     return _side_by_side(
         [first, second if pose is None else _move_world(second, pose)], whole, "pass prefix=", by_name=False
     )
-
-
-def _check_plain(model: Model) -> None:
-    """Refuse a model whose q holds more than the coordinates of its joints."""
-    if model.nq > model.topology.nq:
-        raise ValueError(f"model {model.name!r} is a {type(model).__name__}; join models before contacts are added")
 
 
 def add_prefix(model: Model, prefix: Any) -> Model:

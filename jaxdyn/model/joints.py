@@ -58,18 +58,6 @@ def screw_mask(kind: str) -> np.ndarray:
     return np.repeat([slides, turns], 3)
 
 
-def motion_subspace(kind: str, screw: Float[Array, "6"]) -> Float[Array, "6 nj"]:
-    """Constant motion subspace S of a joint in its body frame: relative twist = S v.
-
-    **Arguments:** `kind`, a key of `KINDS`; `screw` (6,), unit twist of a one-degree-of-freedom joint (m or 1, body frame).
-
-    **Returns:** (6, nv of the joint).
-    """
-    if kind in SCREW_KINDS:
-        return screw[:, None]
-    return jnp.asarray(np.eye(6)[:, KINDS[kind].columns], dtype=screw.dtype)
-
-
 def joint_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, " nqj"]) -> Float[Array, "4 4"]:
     """Pose of the body frame relative to its home pose, exp(hat(screw) q) for the screw kinds.
 

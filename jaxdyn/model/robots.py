@@ -14,36 +14,17 @@ from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 
 _QUARTER = np.pi / 2
-_IIWA_RPY = (
-    (0, 0, 0),
-    (_QUARTER, 0, np.pi),
-    (_QUARTER, 0, np.pi),
-    (_QUARTER, 0, 0),
-    (-_QUARTER, np.pi, 0),
-    (_QUARTER, 0, 0),
-    (-_QUARTER, np.pi, 0),
+# For each joint: position in its parent and rotation there (rpy); mass, centre of mass and principal moments of its body; limits
+# of angle (deg), speed (deg/s) and torque.
+_IIWA = (
+    ((0, 0, 0.1575), (0, 0, 0), 5.76, (0, -0.03, 0.12), (0.033, 0.0333, 0.0123), 170, 85, 320),
+    ((0, 0, 0.2025), (_QUARTER, 0, np.pi), 6.35, (0.0003, 0.059, 0.042), (0.0305, 0.0304, 0.011), 120, 85, 320),
+    ((0, 0.2045, 0), (_QUARTER, 0, np.pi), 3.5, (0, 0.03, 0.13), (0.025, 0.0238, 0.0076), 170, 100, 176),
+    ((0, 0, 0.2155), (_QUARTER, 0, 0), 3.5, (0, 0.067, 0.034), (0.017, 0.0164, 0.006), 120, 75, 176),
+    ((0, 0.1845, 0), (-_QUARTER, np.pi, 0), 3.5, (0.0001, 0.021, 0.076), (0.01, 0.0087, 0.00449), 170, 130, 110),
+    ((0, 0, 0.2155), (_QUARTER, 0, 0), 1.8, (0, 0.0006, 0.0004), (0.0049, 0.0047, 0.0036), 120, 135, 40),
+    ((0, 0.081, 0), (-_QUARTER, np.pi, 0), 1.2, (0, 0, 0.02), (0.001, 0.001, 0.001), 175, 135, 40),
 )
-_IIWA_XYZ = (
-    (0, 0, 0.1575),
-    (0, 0, 0.2025),
-    (0, 0.2045, 0),
-    (0, 0, 0.2155),
-    (0, 0.1845, 0),
-    (0, 0, 0.2155),
-    (0, 0.081, 0),
-)
-_IIWA_INERTIAS = (
-    (5.76, (0, -0.03, 0.12), (0.033, 0.0333, 0.0123)),
-    (6.35, (0.0003, 0.059, 0.042), (0.0305, 0.0304, 0.011)),
-    (3.5, (0, 0.03, 0.13), (0.025, 0.0238, 0.0076)),
-    (3.5, (0, 0.067, 0.034), (0.017, 0.0164, 0.006)),
-    (3.5, (0.0001, 0.021, 0.076), (0.01, 0.0087, 0.00449)),
-    (1.8, (0, 0.0006, 0.0004), (0.0049, 0.0047, 0.0036)),
-    (1.2, (0, 0, 0.02), (0.001, 0.001, 0.001)),
-)
-_IIWA_DEGREES = (170, 120, 170, 120, 170, 120, 175)
-_IIWA_DEGREES_PER_SECOND = (85, 85, 100, 75, 130, 135, 135)
-_IIWA_TORQUES = (320, 320, 176, 176, 110, 40, 40)
 
 
 def iiwa(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Model:
@@ -54,19 +35,18 @@ def iiwa(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) -> Mo
     Source: kinematics and inertias of Drake's benchmark kuka_iiwa_robot; limits (rad, rad/s, N m) of KUKA's data sheet.
     """
     builder = ModelBuilder("iiwa", gravity=gravity, dtype=dtype).add_body("iiwa_link_0", joint="fixed")
-    for i in range(7):
-        reach = np.radians(_IIWA_DEGREES[i])
+    for i, (place, rpy, *inertia, degrees, speed, torque) in enumerate(_IIWA):
         builder.add_body(
             f"iiwa_link_{i + 1}",
             f"iiwa_link_{i}",
             "revolute",
-            _IIWA_INERTIAS[i],
+            inertia,
             joint_name=f"iiwa_joint_{i + 1}",
-            pose=(_IIWA_XYZ[i], _IIWA_RPY[i]),
-            lower=-reach,
-            upper=reach,
-            velocity_limit=np.radians(_IIWA_DEGREES_PER_SECOND[i]),
-            effort_limit=_IIWA_TORQUES[i],
+            pose=(place, rpy),
+            lower=-np.radians(degrees),
+            upper=np.radians(degrees),
+            velocity_limit=np.radians(speed),
+            effort_limit=torque,
         )
     return builder.build()
 

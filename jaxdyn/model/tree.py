@@ -23,7 +23,7 @@ from jaxdyn.model.topology import coordinate_index, frame_index, velocity_indice
 class Model(eqx.Module):
     """Tree of rigid bodies joined by screws, a pytree: the topology is static, every parameter is an array leaf.
 
-    Build one with `ModelBuilder` or `load_urdf`. Shapes, units and frames of the leaves:
+    Build one with `ModelBuilder` or `load_model`. Shapes, units and frames of the leaves:
 
     - `home` (nb, 4, 4): pose of each body frame in its parent body frame at the joint's zero (m).
     - `screws` (nb, 6): unit twist (v, omega) of each one-degree-of-freedom joint in its body frame; zero for other kinds.

@@ -17,8 +17,7 @@ from jaxdyn.constraints.loops import Distance, Loop
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.rolling import RollingContact
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid
-from jaxdyn.grasp.contacts import Contact
-from jaxdyn.grasp.hand import Grasp
+from jaxdyn.grasp.hand import Contact, Grasp
 from jaxdyn.model import host_math
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.topology import frame_index

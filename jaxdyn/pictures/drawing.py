@@ -282,10 +282,9 @@ class _Picture:
             self.drawn.append(self.ax.add_collection3d(faces, autolim=False))
 
     def _lines(self, row: int, length: float) -> None:
-        for _, _, place, axis in self.axes:
-            if axis is not None:
-                ends = np.stack([place[0, row] - length * axis[0, row], place[0, row] + length * axis[0, row]])
-                self._plot(ends, color=AXIS, linewidth=1.1, alpha=0.8)
+        for place, axis in self.axes:
+            ends = np.stack([place[0, row] - length * axis[0, row], place[0, row] + length * axis[0, row]])
+            self._plot(ends, color=AXIS, linewidth=1.1, alpha=0.8)
         for mark in self.marks:
             ends = np.stack([mark.a[0, row], mark.b[0, row]])
             style: dict = dict(linestyle="--", linewidth=1.2) if mark.kind == "distance" else dict(linestyle="none")

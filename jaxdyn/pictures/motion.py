@@ -14,7 +14,7 @@ from jaxdyn.constraints.loops import Distance, Loop
 from jaxdyn.contact.cones import components
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.kinematics import forward_kinematics
-from jaxdyn.grasp.contacts import Contact
+from jaxdyn.grasp.hand import Contact
 from jaxdyn.model.arguments import as_array
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model
@@ -76,7 +76,7 @@ def drawable(scene: Any) -> Scene:
     if not isinstance(scene.system, Model):
         raise ValueError(
             f"the system is a {type(scene.system).__name__}, which has no bodies to draw; a Model has (jd.ModelBuilder, "
-            "jd.load_urdf, ...). Its coordinates over time: jd.plot.states(scene, solution)"
+            "jd.load_model, ...). Its coordinates over time: jd.plot.states(scene, solution)"
         )
     return scene
 
@@ -157,11 +157,6 @@ def _ends(motion: Motion, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     return tuple(frame_poses(model, motion.poses, body) @ np.asarray(pose, float) for body, pose in ends)  # pyright: ignore[reportReturnType]
 
 
-def _relative_pose(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    transpose = np.swapaxes(a[..., :3, :3], -1, -2)
-    return transpose @ b[..., :3, :3], (transpose @ (b[..., :3, 3:] - a[..., :3, 3:]))[..., 0]
-
-
 def marks(motion: Motion) -> list[Mark]:
     """Marks of the constraints between bodies."""
     drawn = []
@@ -197,7 +192,8 @@ def _contact(motion: Motion, constraint: Pair, a: np.ndarray, b: np.ndarray) -> 
 
 def _rows(motion: Motion, a: np.ndarray, b: np.ndarray) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Rotations and positions of frame B in A, and configurations, of all rows of all trajectories."""
-    R, p = _relative_pose(a, b)
+    transpose = np.swapaxes(a[..., :3, :3], -1, -2)
+    R, p = transpose @ b[..., :3, :3], (transpose @ (b[..., :3, 3:] - a[..., :3, 3:]))[..., 0]
     return tuple(jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in (R, p, motion.q))  # pyright: ignore[reportReturnType]
 
 
@@ -284,14 +280,12 @@ def _wrenches(model: Model, constraint: Pair, R, p, q, lam):
     return jax.vmap(lambda R, p, q, lam: constraint.at(model, q).wrench(R, p, lam))(R, p, q, lam)
 
 
-def joint_axes(motion: Motion) -> list[tuple[str, str, np.ndarray, np.ndarray | None]]:
-    """Name, kind, position (n, nt, 3) and axis (n, nt, 3) (None without one) of each joint."""
+def joint_axes(motion: Motion) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Position (n, nt, 3) and axis (n, nt, 3) of each joint that has one."""
     model, axes = motion.scene.system, []
-    for i, (name, kind) in enumerate(zip(model.joint_names, model.topology.kinds, strict=True)):
-        axis = None
+    for i, kind in enumerate(model.topology.kinds):
         if kind in SCREW_KINDS or kind == "planar":
             screw = np.asarray(model.screws, float)[i]
             local = np.eye(3)[2] if kind == "planar" else screw[:3] if kind == "prismatic" else screw[3:]
-            axis = motion.poses[:, :, i, :3, :3] @ local
-        axes.append((name, kind, motion.poses[:, :, i, :3, 3], axis))
+            axes.append((motion.poses[:, :, i, :3, 3], motion.poses[:, :, i, :3, :3] @ local))
     return axes

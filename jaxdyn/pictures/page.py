@@ -2,10 +2,15 @@
 
 import contextlib
 import html
+import io
 import itertools
+import logging
 import os
+import socket
+import sys
 import threading
 import time
+import webbrowser
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,16 +21,7 @@ from jaxdyn.model.host_math import quaternion
 from jaxdyn.pictures.default_solids import frame_poses
 from jaxdyn.pictures.drawing import CONE_HEIGHT, arrow_length, cone_sides, scale_forces
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of, select_rows
-from jaxdyn.pictures.server import (
-    HOST,
-    free_port,
-    is_interactive,
-    open_browser,
-    recording_server,
-    start_server,
-    stop_server,
-)
-from jaxdyn.pictures.solids import Shapes, by_frame, merge_meshes, sharpen, simplify
+from jaxdyn.pictures.solids import Shapes, merge_meshes, sharpen, simplify
 from jaxdyn.pictures.stage import COLORS, LOOP, Stage, all_solids, color_of, paint_sectors, rgb, stage_of
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
@@ -77,7 +73,9 @@ def view(
         print(
             "No browser could be opened; open that address in one, or write a file: jd.pictures.save_html(path, scene, solution)"
         )
-    if (not is_interactive()) if block is None else block:
+    # sys.ps1 exists at a prompt only.
+    is_interactive = hasattr(sys, "ps1") or "ipykernel" in sys.modules
+    if (not is_interactive) if block is None else block:
         # Ctrl-C closes the page, and the script continues.
         with contextlib.suppress(KeyboardInterrupt):
             while True:
@@ -142,7 +140,8 @@ class Viewer:
             stop_server(self._server)
 
     def _repr_html_(self) -> str:
-        return embed(_document(self._motion, self._parts))
+        page = html.escape(_document(self._motion, self._parts))
+        return f'<iframe srcdoc="{page}" width="100%" height="480" style="border:0"></iframe>'
 
     def _add_controls(self) -> None:
         gui, ts = self._server.gui, self._motion.ts
@@ -170,11 +169,6 @@ class Viewer:
                     slider.value = float(ts[0]) if now > ts[-1] else float(now)
 
         threading.Thread(target=run, daemon=True).start()
-
-
-def embed(document: str, height: int = 480) -> str:
-    """Embed a page in another one, as notebooks do."""
-    return f'<iframe srcdoc="{html.escape(document)}" width="100%" height="{height}" style="border:0"></iframe>'
 
 
 def _document(motion: Motion, parts: Shapes) -> str:
@@ -293,10 +287,10 @@ def _attitude(cone: Cone, row: int) -> np.ndarray:
 
 def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
     """Yield frame, colour, opacity, vertices and faces, one mesh for each frame and colour."""
-    groups = []
-    for frame, _, opacity, members in by_frame(parts):
-        parts_of = [shape.triangles() for shape in members]
-        groups.append((frame, color_of(members[0], motion.scene.system), opacity, parts_of))
+    alike: dict[tuple, list] = {}
+    for shape in parts:
+        alike.setdefault((shape.frame, color_of(shape, motion.scene.system), shape.opacity), []).append(shape)
+    groups = [(*key, [shape.triangles() for shape in members]) for key, members in alike.items()]
     total = sum(len(vertices) for *_, meshes in groups for vertices, _ in meshes)
     # Each mesh keeps the same fraction of its vertices, so that large ones do not use up the budget.
     share = min(1.0, most / max(total, 1))
@@ -338,3 +332,82 @@ def _set_stage(server, stage: Stage) -> None:
     camera.near, camera.far = float(0.01 * stage.size), float(100 * stage.size)
     camera.look_at = stage.centre
     camera.position = stage.centre + distance * stage.eye
+
+
+# --- local servers of viser for browser pages: their ports, log records and browsers ---
+
+
+HOST = "127.0.0.1"
+
+
+def start_server(port: int) -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError("the viewer needs viser: pip install jaxdyn[view]") from error
+    # Before the server starts, since browsers may connect at once.
+    _port_filter.ports.add(port)
+    logging.getLogger("websockets.server").addFilter(_port_filter)
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+        return viser.ViserServer(host=HOST, port=port, label="jaxdyn", verbose=False)
+
+
+def stop_server(server) -> None:
+    with contextlib.redirect_stdout(io.StringIO()):
+        server.stop()
+    _port_filter.ports.discard(server.get_port())
+    if not _port_filter.ports:
+        logging.getLogger("websockets.server").removeFilter(_port_filter)
+
+
+class _PortFilter(logging.Filter):
+    """Log filter for our own ports, to which probes connect without a request (a browser's, a test's).
+
+    Records of other servers in the process pass.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.ports: set[int] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        address = getattr(getattr(record, "websocket", None), "local_address", None)
+        return not (isinstance(address, tuple) and len(address) > 1 and address[1] in self.ports)
+
+
+_port_filter = _PortFilter()
+
+
+@contextlib.contextmanager
+def recording_server() -> Iterator[Any]:
+    """Temporary server for recording a page; viser records only from a server."""
+    server = start_server(free_port(None))
+    try:
+        yield server
+    finally:
+        stop_server(server)
+
+
+def free_port(port: int | None) -> int:
+    """Check that a port is free, or find a free one. **Raises:** ValueError for one in use or out of range."""
+    if port is not None and not (isinstance(port, int) and 0 < port < 65536):
+        raise ValueError(f"port is {port!r}; give a number from 1 to 65535, or None for a free one")
+    with socket.socket() as probe:
+        # A port in TIME_WAIT, of a viewer just closed, counts as free.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port or 0))
+        except OSError as error:
+            raise ValueError(
+                f"port {port} cannot be used ({error.strerror}); give another one, or None for a free one"
+            ) from error
+        return probe.getsockname()[1]
+
+
+def open_browser(url: str) -> bool:
+    """Open a graphical browser; return False where there is none."""
+    if sys.platform.startswith("linux") and not any(
+        os.environ.get(x) for x in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+    ):
+        return False
+    return webbrowser.open(url)

@@ -1,9 +1,19 @@
 """Solids of a mechanism as triangles: boxes, balls, cylinders and meshes, each on a frame of the model."""
 
 import dataclasses
-from collections.abc import Iterator
+import os
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+
+from jaxdyn.io.loaded import NotTakenWarning
+from jaxdyn.io.mjcf_file import assign_names, compile_file, import_mujoco, pose_of
+from jaxdyn.io.sdf_file import SdfFile
+from jaxdyn.io.solids import Element, geom_solid, sdf_elements, urdf_elements
+from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import host_math
+from jaxdyn.model.arguments import warn
 
 _SIDES = 24  # of a circle
 
@@ -75,20 +85,9 @@ def rod(frame: str | None, start, end, radius: float, **options) -> Shape:
     """Capsule between two points (3,) in the frame."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
-    return Shape(frame, "capsule", (radius, length), along((start + end) / 2, end - start), **options)
-
-
-def along(place, direction) -> np.ndarray:
-    """Pose (4, 4) at a position with z along a direction; the identity rotation for a zero direction."""
-    pose, length = np.eye(4), np.linalg.norm(direction)
-    pose[:3, 3] = place
-    if length > 0:
-        z = np.asarray(direction, float) / length
-        # The unit vector least parallel to z keeps the cross product well conditioned.
-        helper = np.eye(3)[np.argmin(np.abs(z))]
-        x = np.cross(helper, z) / np.linalg.norm(np.cross(helper, z))
-        pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    return pose
+    pose = host_math.rotation_from_z((end - start) / length) if length > 0 else np.eye(4)
+    pose[:3, 3] = (start + end) / 2
+    return Shape(frame, "capsule", (radius, length), pose, **options)
 
 
 def _triangles(kind: str, size: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -157,17 +156,115 @@ def sharpen(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tupl
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def by_frame(shapes: Shapes) -> Iterator[tuple[str | None, tuple | None, float, list[Shape]]]:
-    """Yield the solids in groups of equal frame, colour and opacity."""
-    groups: dict[tuple, list[Shape]] = {}
-    for shape in shapes:
-        groups.setdefault((shape.frame, shape.color, shape.opacity), []).append(shape)
-    for (frame, color, opacity), members in groups.items():
-        yield frame, color, opacity, members
-
-
 def merge_meshes(parts) -> tuple[np.ndarray, np.ndarray]:
     """Merge several meshes."""
     import trimesh
 
     return trimesh.util.append_faces(*zip(*parts, strict=True))
+
+
+# --- visual solids of URDF, MJCF and SDF files, each on the frame of its link in the models of `jaxdyn.io` ---
+
+
+_SHOWN_GROUPS = 3
+_DEFAULT_GREY = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom
+
+
+def shapes(
+    path: str | os.PathLike,
+    *,
+    arguments: Mapping[str, Any] | None = None,
+    packages: Mapping[str, str | os.PathLike] | None = None,
+) -> Shapes:
+    """Read the visual solids of a URDF, MJCF or SDF file, for `jd.view`, `jd.pictures.save_html` and `jd.draw`.
+
+    They are the elements <visual>, or the geoms of groups 0 to 2, which MuJoCo shows, without planes and height fields. A body
+    whose mesh is missing is drawn by its inertia. A model holds no geometry, so the file is read again. Meshes are STL, DAE, OBJ,
+    PLY or GLB files, searched at the path given in the file, `package://` and `model://` in the folders above the file and
+    in those of ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and GZ_SIM_RESOURCE_PATH.
+
+    **Arguments:** `path`, the file; its root element determines the format. `arguments`, `packages`: of a xacro file, as for
+    `jd.load`.
+
+    **Returns:** `Shapes`, a tuple of `Shape`s, with `.missing`, descriptions of elements that could not be drawn.
+
+    **Warns:** `NotTakenWarning` naming meshes that are missing or cannot be read.
+
+    **Raises:** ValueError with file and line for a file that cannot be read and for another format. ImportError without
+    mujoco (MJCF); without trimesh meshes are named in the warning.
+
+    ```python
+    solids = jd.pictures.shapes("robot.urdf")
+    jd.pictures.save_html("robot.html", model, solution, shapes=solids)
+    ```
+    """
+    file = XmlFile(path, "robot", arguments, packages)
+    readers = {"robot": _urdf, "mujoco": _mjcf, "sdf": _sdf}
+    if file.root.tag not in readers:
+        raise file.fault(file.root, f"the root element is <{file.root.tag}>; expected <robot>, <mujoco> or <sdf>")
+    drawn = readers[file.root.tag](file)
+    if drawn.missing:
+        warn(f"{path}: not drawn from the file: {'; '.join(drawn.missing)}", NotTakenWarning)
+    return drawn
+
+
+def _urdf(file: XmlFile) -> Shapes:
+    missing: list[str] = []
+
+    def rgba_of(material) -> tuple[float, ...] | None:
+        color = material.find("color")
+        return None if color is None else tuple(file.numbers(color, 4, "a material", "rgba").tolist())
+
+    # Materials may be defined once, at the robot or in any link, and named elsewhere.
+    materials = {element.get("name"): rgba for element in file.root.iter("material") if (rgba := rgba_of(element))}
+    drawn: list[Shape] = []
+    for visual in urdf_elements(file, "visual", missing):
+        material = visual.xml.find("material")
+        # A colour in the element itself wins over the named one.
+        rgba = None if material is None else rgba_of(material) or materials.get(material.get("name"))
+        drawn += _shapes_of(visual, *((None, 1.0) if rgba is None else (rgba[:3], rgba[3])))
+    return Shapes(drawn, missing)
+
+
+def _sdf(file: XmlFile) -> Shapes:
+    scene, missing, drawn = SdfFile(file.source), [], []
+    for visual in sdf_elements(scene, "visual", missing):
+        what = f"<visual> of link {visual.frame!r}"
+        diffuse = visual.xml.find("material/diffuse")
+        color = None if diffuse is None else tuple(scene.numbers(diffuse, (3, 4), what).tolist()[:3])
+        drawn += _shapes_of(visual, color, 1.0 - scene.number(visual.xml, "transparency", 0.0, what))
+    return Shapes(drawn, missing)
+
+
+def _shapes_of(visual: Element, color, opacity: float) -> list[Shape]:
+    # The mesh file's own colour has the lowest priority.
+    return [
+        Shape(visual.frame, one.kind, one.size, visual.pose, color or one.color, opacity, one.vertices, one.faces)
+        for one in visual.solids
+        if one.kind != "plane"
+    ]
+
+
+def _mjcf(file: XmlFile) -> Shapes:
+    mujoco = import_mujoco()
+    m, gone = compile_file(mujoco, file.path)
+    bodies = assign_names(mujoco, m, file.path).bodies
+    shapes = []
+    for g in range(m.ngeom):
+        solid = geom_solid(m, g)
+        if solid is None or solid.kind == "plane" or m.geom_group[g] >= _SHOWN_GROUPS:
+            continue
+        # `compile_file` replaces missing meshes by points of this size.
+        if gone and solid.size == (1e-3,) * 3:
+            continue
+        material = int(m.geom_matid[g])
+        rgba = tuple(float(x) for x in (m.mat_rgba[material] if material >= 0 else m.geom_rgba[g]))
+        # Geoms for contact alone are often made invisible this way.
+        if rgba[3] == 0:
+            continue
+        # A colour that the file does not state leaves the body's own colour of the picture.
+        color = None if material < 0 and np.allclose(rgba, _DEFAULT_GREY) else rgba[:3]
+        pose = pose_of(m.geom_pos[g], m.geom_quat[g])
+        body = bodies[m.geom_bodyid[g]]
+        shapes.append(Shape(body, solid.kind, solid.size, pose, color, rgba[3], solid.vertices, solid.faces))
+    return Shapes(shapes, gone)

@@ -18,10 +18,10 @@ from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.branches import sign_of_determinant
-from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.rank import REGULAR, RESIDUAL, condition_number, eps_of, pseudo_inverse, rank_of, tolerance
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
+from jaxdyn.model.arguments import Number, Numbers, as_shape, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
@@ -55,9 +55,8 @@ class Basis(eqx.Module):
 
         def velocity(q, t):
             parametrization = self.at(scene, q, t)
-            return matmul(
-                parametrization.N, _check_columns(nu, parametrization.N)
-            ) + parametrization.v0, parametrization
+            N, v0, _ = parametrization
+            return matmul(N, as_shape(nu, "nu", N.dtype, N.shape[1:], of=COLUMNS)) + v0, parametrization
 
         # `linearize` and not `jvp`: the direction, dq/dt for this v, is known only with the value.
         v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
@@ -128,7 +127,10 @@ class UserBasis(Basis):
         # The quality decides on singularity and has no derivative.
         lengths = jnp.sqrt(jnp.sum(lax.stop_gradient(N * N), 0))
         some = jnp.all(lengths > 0)
-        pivot = _least_pivot(N / jnp.where(some, lengths, jnp.ones_like(lengths))[None])
+        unit = lax.stop_gradient(N) / jnp.where(some, lengths, jnp.ones_like(lengths))[None]
+        pivot = jnp.min(jnp.diagonal(cholesky(matmul(unit.T, unit))))
+        # The Cholesky factor of dependent columns is NaN.
+        pivot = jnp.where(jnp.isfinite(pivot), pivot, jnp.zeros_like(pivot))
         # Fewer columns would be a further constraint, more of them cannot all be tangent.
         whole = scene.nv - rank_of(A, inverse) == N.shape[1]
         off = jnp.abs(matmul(A, v0) - b)
@@ -188,7 +190,7 @@ class Orthonormal(Basis):
         """
         parametrization, A, inverse, factor = self._at(scene, q, t)
         N = parametrization.N
-        nu = _check_columns(nu, N)
+        nu = as_shape(nu, "nu", N.dtype, N.shape[1:], of=COLUMNS)
         v = matmul(N, nu) + parametrization.v0
         along_motion = (q, t), (velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
         # Rates of A and v0 alone: the factorisation that gave N is not differentiated.
@@ -253,6 +255,9 @@ def as_basis(basis: BasisLike | None, scene: Scene) -> Basis:
     return Orthonormal(jnp.asarray(basis))
 
 
+COLUMNS = " as the basis has columns"  # of nu, in messages
+
+
 class VelocityAndDrift(NamedTuple):
     """Velocity v (nv,), its drift (nv,), the rate at constant nu, N (nv, nr) and its quality ()."""
 
@@ -260,14 +265,6 @@ class VelocityAndDrift(NamedTuple):
     drift: Array
     N: Array
     quality: Array
-
-
-def _check_columns(nu, N):
-    if nu.shape != N.shape[1:]:
-        raise ValueError(
-            f"nu has shape {nu.shape}, expected {N.shape[1:]} as the basis has columns{batch_hint(nu, (1,))}"
-        )
-    return nu
 
 
 def tangent_basis(
@@ -341,12 +338,12 @@ def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
     scene = independent_rows(scene, q, t)
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
     # The pivots of its columns are the dependent velocities.
-    columns, pivots = _pivots(A.T)
+    columns, pivots = pivot_rows(A.T)
     dependent = columns[pivots > 1e-9 * np.linalg.norm(A)]
     return tuple(np.setdiff1d(np.arange(scene.nv), dependent).tolist())
 
 
-def _pivots(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pivot_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the rows of a concrete B by their distance from the span of those before them, and these distances."""
     rest, rows, pivots = np.array(B), [], []
     for _ in range(min(B.shape)):
@@ -370,7 +367,7 @@ def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Floa
 
 def least_quality(dtype) -> float:
     """Quality below which a parametrisation counts as singular: reciprocal condition 5e-7 in float64."""
-    return float(jnp.finfo(dtype).eps) ** 0.4
+    return float(jnp.finfo(dtype).eps) ** REGULAR
 
 
 constraint_jacobian_compiled = entry_point(constraint_jacobian)
@@ -381,13 +378,6 @@ def _affine_rows(scene, q, t):
     return constraint_jacobian(scene, q, t), -velocity_residual(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
 
 
-def _least_pivot(columns):
-    """Least pivot of the Cholesky factor of columns^T columns, 0 for dependent columns."""
-    pivot = jnp.min(jnp.diagonal(cholesky(lax.stop_gradient(matmul(columns.T, columns)))))
-    # The Cholesky factor of dependent columns is NaN.
-    return jnp.where(jnp.isfinite(pivot), pivot, jnp.zeros_like(pivot))
-
-
 def _tangent_only(A, N, quality):
     """Quality, or 0 where A N is nonzero beyond rounding."""
     limit = _rounding(A) * jnp.sqrt(jnp.sum(A * A) * jnp.sum(N * N))
@@ -396,4 +386,4 @@ def _tangent_only(A, N, quality):
 
 def _rounding(like) -> float:
     """Relative size below which a residual is rounding error."""
-    return float(jnp.finfo(like.dtype).eps) ** 0.5
+    return eps_of(like) ** RESIDUAL

@@ -16,8 +16,15 @@ from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
-from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis
+from jaxdyn.model.arguments import Numbers, as_shape, check_state, zeros_if_none
+from jaxdyn.reduction.bases import (
+    Independent,
+    Orthonormal,
+    as_basis,
+    constraint_jacobian_compiled,
+    pivot_rows,
+    tangent_basis,
+)
 from jaxdyn.reduction.minimal import reduce
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.mass_factor import solve_positive
@@ -78,7 +85,7 @@ def involutive(
     # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
     # bracketed with the others and spans nothing itself.
     levels: tuple[tuple[tuple[int, int], ...], ...] = ()
-    new = np.asarray(_fields_compiled(scene, reference, q, t, levels), float)[:, :count]
+    new = np.asarray(_fields(scene, reference, q, t, levels), float)[:, :count]
     spanned, ranks, evidence = np.zeros((scene.nq, 0)), [], []
     # Every pass but the last adds a dimension, of which there are at most nq.
     while True:
@@ -98,25 +105,18 @@ def involutive(
         spanned = np.concatenate([spanned, new[:, kept]], 1)
         pairs = [(i, k) for k in kept for i in range(count + 1) if levels or i > k]  # [X_k, X_i] = -[X_i, X_k]
         levels = (*levels, tuple(pairs))
-        new = np.asarray(_fields_compiled(scene, reference, q, t, levels), float)
+        new = np.asarray(_fields(scene, reference, q, t, levels), float)
 
 
 def _independent(spanned, new, limit) -> list[int]:
     """Select columns of `new` that add a direction to those of `spanned`, the largest first."""
     # Directions in the span already are removed once; pivoting then needs only the new columns.
-    rest, kept = new - spanned @ np.linalg.lstsq(spanned, new, rcond=None)[0] if spanned.shape[1] else new, []
-    # As many directions as there are rows or columns: at a threshold of zero what is left is rounding, without end.
-    for _ in range(min(rest.shape)):
-        sizes = np.linalg.norm(rest, axis=0)
-        k = int(np.argmax(sizes))
-        if sizes[k] <= limit:
-            break
-        along = rest[:, k] / sizes[k]
-        rest = rest - np.outer(along, along @ rest)
-        kept.append(k)
-    return kept
+    rest = new - spanned @ np.linalg.lstsq(spanned, new, rcond=None)[0] if spanned.shape[1] else new
+    columns, pivots = pivot_rows(rest.T)
+    return columns[pivots > limit].tolist()
 
 
+@eqx.filter_jit
 def _fields(scene, reference, q, t, levels):
     """Rates of q (nq, n) of the last level of brackets; level 0 has the columns of N(q, t) and the drift (v0, d/dt)."""
 
@@ -145,9 +145,6 @@ def _fields(scene, reference, q, t, levels):
     for pairs in levels:
         last = brackets(last, pairs)
     return last(jnp.concatenate([q, t[None]]))[:, :-1].T
-
-
-_fields_compiled = eqx.filter_jit(_fields)
 
 
 class SpuriousTerms(NamedTuple):
@@ -196,14 +193,14 @@ def spurious_terms(
     scene = as_scene(scene)
     tau = zeros_if_none(tau, scene.nv)
     q, tau, t = check_state(scene.system, q=q, tau=tau, t=t)
-    nu = as_array(nu, "nu", q.dtype)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so there is nothing to substitute; add some")
     if scene.nq != scene.nv:
         raise ValueError(f"the system has nq = {scene.nq}, nv = {scene.nv}; substitution needs v = dq/dt")
     choice = as_basis(tuple(independent) if isinstance(independent, Sequence) else independent, scene)
-    if not isinstance(choice, Independent) or nu.shape != (choice.size(scene),):
-        raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,){batch_hint(nu, (1,))}")
+    if not isinstance(choice, Independent):
+        raise ValueError(f"independent is {independent!r}; give a tuple of indices of velocities")
+    nu = as_shape(nu, "nu", q.dtype, (choice.size(scene),), of=" = (nr,)")
     terms, depends = _substitute(independent_rows(scene, q, t), choice, q, nu, tau, t)
     if is_concrete(depends) and float(depends) > 1e-9:
         raise ValueError(

@@ -25,12 +25,12 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout, rows, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.dynamics import total_force, whiten_rows
-from jaxdyn.constraints.rank import check_tolerance, eps_of, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.rank import RESIDUAL, check_tolerance, eps_of, pseudo_inverse, rank_of, tolerance
 from jaxdyn.constraints.redundancy import distribute_multipliers
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
+from jaxdyn.model.arguments import Numbers, as_array, as_shape, check_state
 from jaxdyn.model.topology import velocity_indices
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor
@@ -116,16 +116,9 @@ def constrained_inverse_dynamics(
     chosen = where if independent is None else velocity_choice(scene, independent, "independent")
     if chosen is None:
         raise ValueError("motors is a matrix, which names no velocities; give independent as well")
-    a_independent = as_array(a_independent, "a_independent", q.dtype)
-    if a_independent.shape != (len(chosen),):
-        named = f"{(len(chosen),)}, one per independent velocity{batch_hint(a_independent, (1,))}"
-        raise ValueError(f"a_independent has shape {a_independent.shape}, expected {named}")
-    v = as_array(v, "v", q.dtype)
-    if v.shape not in ((scene.nv,), (len(chosen),)):
-        raise ValueError(
-            f"v has shape {v.shape}, expected {(scene.nv,)} = (nv,) or {(len(chosen),)}, the independent velocities"
-            f"{batch_hint(v, (1,))}"
-        )
+    count = (len(chosen),)
+    a_independent = as_shape(a_independent, "a_independent", q.dtype, count, of=", one per independent velocity")
+    v = as_shape(v, "v", q.dtype, (scene.nv,), count, of=", all velocities or the independent ones")
     if len(chosen) == scene.nv and chosen != tuple(range(scene.nv)):
         # v would have two meanings: the velocities in the model's order, and the independent ones in the order named.
         names = "independent" if independent is not None else "motors"
@@ -183,9 +176,7 @@ def velocity_choice(scene: Scene, velocities: Any, argument: str) -> tuple[int, 
 def _weights(weights, count: int, dtype):
     if weights is None:
         return np.ones(count, dtype)
-    weights = as_array(weights, "weights", dtype)
-    if weights.shape != (count,):
-        raise ValueError(f"weights has shape {weights.shape}, expected {(count,)}, one per motor")
+    weights = as_shape(weights, "weights", dtype, (count,), of=", one per motor")
     if is_concrete(weights) and not (np.isfinite(weights).all() and (np.asarray(weights) > 0).all()):
         raise ValueError(f"weights is {np.asarray(weights)}; give positive numbers")
     return weights
@@ -212,7 +203,7 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
     """
     nv, tol, has_rows = scene.nv, tolerance(rank_tol, q), bool(layout(scene))
     # Residuals are not tested more strictly than the dependence of rows is decided.
-    limit = max(eps_of(q) ** 0.5, tol)
+    limit = max(eps_of(q) ** RESIDUAL, tol)
     E = np.eye(nv, dtype=q.dtype)[list(chosen)]
     if has_rows:
         metric, Y = whiten_rows(scene, q, t)

@@ -1,10 +1,10 @@
 """Error against run time of scenes by every sensible integrator, as records, a table and a page."""
 
-from jaxdyn.reports.case import Case as Case
-from jaxdyn.reports.case import Reference as Reference
+from jaxdyn.reports.page import Record as Record
+from jaxdyn.reports.page import Report as Report
 from jaxdyn.reports.page import html_page as html_page
+from jaxdyn.reports.page import pareto_front as pareto_front
 from jaxdyn.reports.page import write as write
-from jaxdyn.reports.records import Record as Record
-from jaxdyn.reports.records import Report as Report
-from jaxdyn.reports.records import pareto_front as pareto_front
+from jaxdyn.reports.programs import Case as Case
+from jaxdyn.reports.programs import Reference as Reference
 from jaxdyn.reports.run import report as report

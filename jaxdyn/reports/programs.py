@@ -1,5 +1,6 @@
-"""Prepared scenes: compiled simulations, the reference motion, and errors relative to it."""
+"""Cases of a report and what is prepared of them: compiled simulations, the reference motion, errors relative to it."""
 
+import inspect
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,16 +11,61 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn import scenes
 from jaxdyn.constraints.assembly import residuals
+from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import quat_to_matrix
 from jaxdyn.model.tree import Model
-from jaxdyn.reports.case import Case, Reference
+from jaxdyn.reports.references import CLOSED_FORMS
+from jaxdyn.reports.references import Reference as Reference
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.events import ContactLost
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers import RK4, Rodas5P
 from jaxdyn.systems.scene import Scene
+
+
+class Case(NamedTuple):
+    """Scene of the report with its measurements.
+
+      - `name`, `text`: name and description.
+      - `build()` -> (scene, (q0, v0)); `reference(start)` -> `Reference`, or None where a
+    converged solution at `ts` is the reference.
+      - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
+      - `reduces`: whether the method "reduced" finds the scene's degrees of freedom.
+    """
+
+    name: str
+    text: str
+    build: Callable[[], tuple[Scene, tuple]]
+    reference: Callable[[Any], Reference] | None
+    ts: np.ndarray
+    steps: int
+    conserves: bool = True
+    stiff: bool = False
+    reduces: bool = True
+
+
+def case_of_scene(name: str) -> Case:
+    """Case of a scene of `jd.scenes`: its default start, one second, and its closed form, or else a converged solution.
+
+    **Raises:** ValueError for other names, and for scenes with forces that have modes, whose steps end at events.
+    """
+    if name not in scenes.names():
+        raise ValueError(f"scenes has {name!r}; give a jaxdyn.reports.Case, or choose from {', '.join(scenes.names())}")
+    if has_modes(getattr(scenes, name)()):
+        raise ValueError(f"scenes has {name!r}, whose steps end at events; a report compares steps of given lengths")
+    scene = getattr(scenes, name)
+    # The first line of a scene's docstring describes it.
+    text = (inspect.getdoc(scene) or name).partition("\n")[0]
+    # The energy of an arbitrary scene need not be constant, so its error is not reported.
+    build = lambda: (scene(), tuple(np.asarray(x) for x in scene.start()))  # noqa: E731
+    ts, known = np.linspace(0.0, 1.0, 11), CLOSED_FORMS.get(name)
+    reference = None if known is None else lambda start: known(ts)
+    return Case(name, text, build, reference, ts, 250, conserves=False)
+
 
 # Solvers by name; those in FIXED run with fixed steps.
 SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
@@ -65,11 +111,12 @@ class Programs:
 
         def one(q, v, ts, setting):
             # The setting is an argument of the program: a ladder of tolerances compiles once.
-            steps = {"stepsize": setting} if solver in FIXED else {"rtol": setting, "atol": setting}
+            size, tolerance = (setting, None) if solver in FIXED else (None, setting)
+            steps = Steps(size, rtol=tolerance, atol=tolerance, max_steps=MOST_STEPS)
             # Only the integration is measured: contacts that pull are reported and do not end it.
-            options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
+            options = {"method": method, "solver": SOLVERS[solver](), "stepsize": steps, "throw": False}
             options["events"] = () if scene.cones is None else (ContactLost(stop=False),)
-            solution = simulate(scene, q, v, ts, **steps, **options)
+            solution = simulate(scene, q, v, ts, **options)
             return solution.q, solution.v, solution.result, solution.stats
 
         several = one if batch == 1 else jax.vmap(one, (0, 0, 0, None))

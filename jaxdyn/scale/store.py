@@ -5,17 +5,20 @@
       partial/            partial results of reductions, one row for each chunk
 
 Every chunk of every array is a file of its own that ends in a CRC-32C (Zarr's codec crc32c), by which a file that is damaged is
-recognised.
+recognised. One process at a time writes to a store, by a lock of filelock and a file that names its owner.
 """
 
+import contextlib
+import getpass
 import importlib.util
 import os
 import shutil
+import socket
 import sys
 import time
 import uuid
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -250,3 +253,35 @@ def _empty(dtype: Any) -> Any:
 def _short(value: Any) -> str:
     text = str(value)
     return text if len(text) <= 200 else f"{text[:100]} ... {text[-90:]}"
+
+
+@contextlib.contextmanager
+def lock_store(path: Path) -> Iterator[tuple[Path, str]]:
+    """Hold the lock of a store; gives the file that names its owner, and its text. The lock of a dead process is free.
+
+    **Raises:** ValueError that names the owner where another process holds it.
+    """
+    from filelock import FileLock, Timeout
+
+    # The owner stands in a file of its own: filelock truncates the lock's file when it tries to acquire it.
+    lock, owner = FileLock(f"{path}.lock"), path.with_name(f"{path.name}.owner")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        # The file is written just after the lock is taken.
+        name = owner.read_text(encoding="utf-8").splitlines()[0] if owner.exists() else "another process"
+        raise ValueError(
+            f"out is {str(path)!r}, to which {name} is writing; wait for it, end it, or name another store"
+        ) from error
+    try:
+        user = str(os.getuid())
+        with contextlib.suppress(KeyError, OSError):  # in a container without an entry for the user
+            user = getpass.getuser()
+        since = time.strftime("%Y-%m-%d %H:%M:%S")
+        # The random line lets workers tell this file from one of the same name on a disk of their own.
+        text = f"process {os.getpid()} of {user} on {socket.gethostname()}, since {since},\n{uuid.uuid4().hex}\n"
+        owner.write_text(text, encoding="utf-8")
+        yield owner, text
+    finally:
+        owner.unlink(missing_ok=True)
+        lock.release()

@@ -10,9 +10,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import rolling_sphere
-from jaxdyn.contact.cones import friction_cone, surface_cone
+from jaxdyn.contact.cones import friction_cone, surface_cone, wrench_cone
 from jaxdyn.contact.unilateral import UnilateralContact, gap_contact, ground_contact
-from jaxdyn.contact.wrench_cones import wrench_cone
 from jaxdyn.grasp import Grasp, contact, point_contacts
 from jaxdyn.model import host_math, inertia, robots
 from jaxdyn.model.arguments import Number, Row

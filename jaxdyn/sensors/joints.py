@@ -10,9 +10,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import layout
-from jaxdyn.constraints.reactions import body_wrenches_where
+from jaxdyn.constraints.frames import body_wrenches_where
 from jaxdyn.constraints.rolling import Touching
-from jaxdyn.dynamics.joint_wrenches import joint_wrench
+from jaxdyn.dynamics.frame_motion import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.forces.elements import sum_wrenches, wrenches_where
 from jaxdyn.lie import se3

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxdyn.simulation.contact_steps import ContactStep as ContactStep
+    from jaxdyn.simulation.events import JointLimitWarning as JointLimitWarning
     from jaxdyn.simulation.methods import Baumgarte as Baumgarte
+    from jaxdyn.simulation.options import Pose as Pose
     from jaxdyn.simulation.stiffness import Stiffness as Stiffness
-    from jaxdyn.simulation.terminal_events import JointLimitWarning as JointLimitWarning
 
 __all__ = [
     "Baumgarte",
     "ContactStep",
     "JointLimitWarning",
+    "Pose",
     "Stiffness",
 ]
 
@@ -28,11 +30,12 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    # At their first use: diffrax, which two of them import, is not needed by runs whose programs are on disk.
+    # At their first use: diffrax, which one of them imports, is not needed by runs whose programs are on disk.
     homes = {
         "Baumgarte": "methods",
         "ContactStep": "contact_steps",
-        "JointLimitWarning": "terminal_events",
+        "JointLimitWarning": "events",
+        "Pose": "options",
         "Stiffness": "stiffness",
     }
     if name not in homes:

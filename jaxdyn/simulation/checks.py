@@ -29,14 +29,13 @@ from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
-from jaxdyn.simulation.options import is_backsolve, is_step_length, is_variational
+from jaxdyn.simulation.options import Pose, is_backsolve, is_step_length
 from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, has_drives
 from jaxdyn.systems.system import has_quaternions, retract
 
-POSE = "pose:"  # prefix of the output of a frame
 CONTACT_OUTPUTS = ("contact_forces", "contact_margins")
 OUTPUTS = (
     *("energy", "power", "work", "acceleration", "multipliers", "constraint_residual", "torque", "control_state"),
@@ -142,27 +141,27 @@ def _check_finite(name: str, value) -> None:
         raise ValueError(f"{name} is {np.asarray(value)[bad[0]]} at index {bad[0]}; give finite numbers")
 
 
-def sort_outputs(scene: Scene, outputs) -> tuple[str, ...]:
+def sort_outputs(scene: Scene, outputs) -> tuple[str | Pose, ...]:
     """Names of outputs in order, each once; refuses names that are no outputs, and frames that do not exist."""
     if isinstance(outputs, str):
         raise ValueError(f"outputs is the string {outputs!r}; pass a tuple, e.g. outputs=({outputs!r},)")
     for name in outputs:
-        if isinstance(name, str) and name.startswith(POSE) and isinstance(scene.system, Model):
-            frame_index(scene.system, name.removeprefix(POSE))
+        if isinstance(name, Pose) and isinstance(scene.system, Model):
+            frame_index(scene.system, name.frame)
         elif name not in OUTPUTS:
-            raise ValueError(f"outputs has {name!r}; choose from {', '.join(OUTPUTS)} and '{POSE}<frame>'")
+            raise ValueError(f"outputs has {name!r}; choose from {', '.join(OUTPUTS)} and jd.simulation.Pose(frame)")
     # Names are static: in one order, the same outputs share a compiled program.
-    return tuple(sorted(set(outputs)))
+    return tuple(sorted(set(outputs), key=lambda name: (isinstance(name, Pose), name)))
 
 
-def check_combination(control, method: Method, solver, adjoint) -> None:
+def check_combination(control, method: Method, adjoint) -> None:
     """Refuse controls and adjoints that a method does not support."""
-    if is_variational(solver) and isinstance(control, (Controller, Sampled)):
+    if isinstance(method, Variational) and isinstance(control, (Controller, Sampled)):
         raise ValueError(
             f"control is a {type(control).__name__}, whose state the steps of method 'variational' do not integrate; take "
             "another method"
         )
-    if is_variational(solver) and is_backsolve(adjoint):
+    if isinstance(method, Variational) and is_backsolve(adjoint):
         raise ValueError(
             "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
         )
@@ -173,7 +172,7 @@ def check_combination(control, method: Method, solver, adjoint) -> None:
         )
 
 
-def check_drives(scene: Scene, control, solver, modal: bool) -> None:
+def check_drives(scene: Scene, control, method: Method, modal: bool) -> None:
     """Refuse drives with a state where nothing integrates it."""
     if not has_drives(scene):
         return
@@ -182,7 +181,7 @@ def check_drives(scene: Scene, control, solver, modal: bool) -> None:
         raise ValueError(
             f"{what} and forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact); leave one of them out"
         )
-    if is_variational(solver):
+    if isinstance(method, Variational):
         raise ValueError(f"{what}, which the steps of method 'variational' do not integrate; take another method")
     if isinstance(control, Controller) and control.takes_multipliers:
         raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")
@@ -208,21 +207,21 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
         raise ValueError(
             f"stepsize is {stepsize!r}, and {what}; leave it out for steps that keep rtol and atol, or give a length (s)"
         )
-    from jaxdyn.simulation.solvers.choice import has_name, is_explicit, label
+    from jaxdyn.simulation.solvers.choice import has_name, has_own_loop, label
 
-    if not is_explicit(solver):
+    if not has_own_loop(solver):
         raise ValueError(
-            f"solver is {label(solver)}, and {what}, whose events are located within explicit steps; take diffrax.Dopri8() or "
-            "Tsit5(), or, where forces are stiff, friction without modes (jd.forces.CoulombFriction)"
+            f"solver is {label(solver)}, and {what}, whose events are located within steps of the library; take an explicit "
+            "solver, such as diffrax.Tsit5(), or, where forces are stiff, jd.solvers.Rodas5P()"
         )
     if is_backsolve(adjoint):
         raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
     if not has_name(adjoint):
         raise ValueError(f"adjoint is {adjoint}, which does not go back through events, and {what}; take 'reverse'")
     for name in outputs:
-        if name not in MODAL_OUTPUTS and not name.startswith(POSE):
+        if name not in MODAL_OUTPUTS and not isinstance(name, Pose):
             raise ValueError(
-                f"outputs has {name!r}, and {what}; choose from {', '.join(MODAL_OUTPUTS)} and 'pose:<frame>'"
+                f"outputs has {name!r}, and {what}; choose from {', '.join(MODAL_OUTPUTS)} and jd.simulation.Pose(frame)"
             )
 
 

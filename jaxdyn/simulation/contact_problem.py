@@ -21,7 +21,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import warn
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
-from jaxdyn.simulation.hybrid.modes import elements_of, extend, force_at
+from jaxdyn.simulation.hybrid.modes import elements_of, extend, force_at, normal_load
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace
@@ -344,7 +344,9 @@ def pose(contacts: Contacts, scene: Scene, q, v, z, tau, t, h) -> _Problem:
     free = v + h * start
     terms = contact_terms(contacts, whole, place, free, end)
     gaps = _gaps(contacts, _own_rows(contacts, whole), q, t) if contacts.elements else jnp.zeros((0,), q.dtype)
-    loads = _loads(contacts, scene, flow.place, v, t + 0.5 * h)
+    middle, none = t + 0.5 * h, jnp.zeros((), q.dtype)
+    loads = [normal_load(scene, contacts.elements[i], flow.place, v, middle) for i in contacts.order]
+    loads = jnp.stack([*loads, *[none] * len(contacts.limited)])
     closes = jnp.any(terms.velocity[contacts.normals] < _bounds(contacts, scene, terms, gaps, v, free, h))
     closes = closes | jnp.any(loads > 0) | bool(contacts.load_rows)
     # Halfway to a velocity without contact forces, damping would be that of a motion that contacts prevent.
@@ -380,19 +382,6 @@ class _Reaction(NamedTuple):
 
     loads: Array
     rates: dict[int, Array]
-
-
-def _loads(contacts: Contacts, scene: Scene, q, v, t) -> Array:
-    """Loads (k,) of frictions in N, zero of contacts."""
-    loads = []
-    for i in contacts.order:
-        one: Any = contacts.elements[i]
-        normal: Any = 0.0 if one.opens or one.normal >= 0 else force_at(scene, one).normal
-        value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
-        if jnp.shape(value) != ():
-            raise ValueError(f"friction {one.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
-        loads.append(jnp.maximum(jnp.asarray(value, q.dtype), 0.0))
-    return jnp.stack([*loads, *[jnp.zeros((), q.dtype)] * len(contacts.limited)])
 
 
 def _in_units(contacts: Contacts, flow: _Flow, Y, place, velocity, terms, velocities, bound, reaction: _Reaction):

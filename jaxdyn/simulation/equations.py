@@ -16,9 +16,10 @@ from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.checks import CONTACT_OUTPUTS, POSE
+from jaxdyn.simulation.checks import CONTACT_OUTPUTS
+from jaxdyn.simulation.events import Conditions, contact_allowances, limit_allowances
 from jaxdyn.simulation.methods import Method, Projected
-from jaxdyn.simulation.terminal_events import WITHIN, Conditions, contact_allowances, limit_allowances
+from jaxdyn.simulation.options import Pose
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
 
@@ -27,6 +28,8 @@ from jaxdyn.systems.system import retract, velocity_to_rate
 KEPT = "kept_rows"
 # Entry of the state: the states of the scene's drives.
 DRIVES = "drives"
+# Entry of the state in diffrax's loop: -1 where an allowance has been negative within the last step, else 1.
+WITHIN = "within_step"
 
 
 def power(force, v):
@@ -237,7 +240,7 @@ def state_outputs(system, outputs, q, v, t) -> dict[str, Any]:
     values: dict[str, Any] = {}
     if "energy" in outputs:
         values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
-    frames = [name.removeprefix(POSE) for name in outputs if name.startswith(POSE)]
+    frames = [one.frame for one in outputs if isinstance(one, Pose)]
     return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
 
 

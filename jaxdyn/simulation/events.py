@@ -1,18 +1,21 @@
 """Events of `jd.simulate`: conditions that end a motion or are reported, and the number of mode switches of a motion."""
 
-import functools
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxdyn.contact.forces import contact_forces, contacts_with_cones
 from jaxdyn.forces.piecewise import has_pieces
-from jaxdyn.model.arguments import Function, Number, as_array, check_flag, warn
+from jaxdyn.model.arguments import Function, Number, as_array, check_flag
 from jaxdyn.model.tree import Model
+from jaxdyn.simulation.solution import RESULTS, Solution, joint_of
 from jaxdyn.systems.scene import Scene, as_pytree
 
 __all__ = ["ContactLost", "JointLimit", "ModeSwitches", "Progress", "Terminal"]
@@ -119,7 +122,6 @@ class Terminal(eqx.Module):
         return as_array(value, "Terminal: function", q.dtype)
 
 
-F = TypeVar("F", bound=Callable)
 Event: TypeAlias = ContactLost | JointLimit | ModeSwitches | Progress | Terminal
 
 
@@ -139,8 +141,6 @@ class Watch(NamedTuple):
 
 _KINDS = (ContactLost, JointLimit, ModeSwitches, Progress)
 _NONE = Watch()
-# Arguments of `simulate` that `events` has replaced.
-_FORMER = {"contacts", "limits", "max_events", "progress"}
 
 
 def sort_events(events: Iterable[Event]) -> tuple[Watch, tuple[Terminal, ...]]:
@@ -211,18 +211,121 @@ def events_of(
     return events + ([] if max_events is None else [ModeSwitches(max_events)]) + ([Progress()] if progress else [])
 
 
-def accept_former_events(function: F) -> F:
-    """Decorator of `simulate`: the arguments that `events` has replaced warn, with the new form."""
+# --- conditions that end a run ---
+#
+# The rows of a contact are two-sided; whether its cone admits the multipliers is tested during the motion. Each of these
+# conditions has an allowance, which is negative where it is violated. The run ends at the first zero of the least allowance that
+# a step shows at its end or within. The library's own loops locate it by shorter steps (`solvers/guards.py`); diffrax's by
+# bisection of the step's dense output. Where a save point alone shows a violation, its time is that of the save point.
 
-    @functools.wraps(function)
-    def call(*args: Any, **options: Any) -> Any:
-        if not _FORMER.isdisjoint(options):
-            given = {name: options.pop(name) for name in sorted(_FORMER & set(options))}
-            former = events_of(**given)
-            options["events"] = [*options.get("events", ()), *former]
-            old = ", ".join(f"{name}={value!r}" for name, value in given.items())
-            new = ", ".join(f"jd.events.{one!r}" for one in former)
-            warn(f"simulate({old}) is now simulate(events=[{new}])", DeprecationWarning)
-        return function(*args, **options)
 
-    return cast(F, call)
+class JointLimitWarning(UserWarning):
+    """A motion has passed a position limit of the model, and continues."""
+
+
+class Conditions(NamedTuple):
+    """Conditions that can end a run: its contacts, its joint limits, its control, and the number of terminal events."""
+
+    contacts: bool
+    limits: bool
+    control: bool
+    terminals: int
+
+    def counts(self, scene: Scene) -> tuple[int, int, int, int]:
+        """Numbers of allowances of contacts, limits, the control and terminal events, in this order among all."""
+        contacts = len(contacts_with_cones(scene)) if self.contacts else 0
+        return contacts, 2 * scene.nq if self.limits else 0, int(self.control), self.terminals
+
+
+def contact_allowances(scene: Scene, multipliers: Float[Array, " nc"]) -> Float[Array, " k"]:
+    """Margin of each contact with a cone, plus the rounding of its force, eps^(1/2) |f|; N. Negative where it is lost."""
+    contacts = contact_forces(scene, multipliers)
+    # A contact that is held exactly on its cone is not lost by rounding.
+    slack = jnp.finfo(multipliers.dtype).eps ** 0.5
+    return jnp.stack(
+        [contacts.margins[name] + slack * jnp.sum(jnp.abs(contacts.forces[name])) for name in contacts.margins]
+    )
+
+
+def limit_allowances(model: Model, q: Float[Array, " nq"]) -> Float[Array, " n"]:
+    """Distances of q above the lower limits, then below the upper ones, plus rounding, eps^(1/2) of the limit's size.
+
+    Negative where a limit is passed, rad or m; a large number where there is none.
+    """
+    # A finite number for "no limit": bisection and products of infinity would give NaN.
+    none = jnp.full_like(q, float(jnp.finfo(q.dtype).max) ** 0.5)
+
+    def allowance(limit, room):
+        slack = jnp.finfo(q.dtype).eps ** 0.5 * jnp.maximum(jnp.abs(limit), jnp.ones_like(limit))
+        return jnp.where(jnp.isfinite(limit), room + slack, none)
+
+    lower, upper = model.lower.astype(q.dtype), model.upper.astype(q.dtype)
+    return jnp.concatenate([allowance(lower, q - lower), allowance(upper, upper - q)])
+
+
+class Violation(NamedTuple):
+    """The first violation: whether and when there was one, and the entry of the allowances, -1 for none."""
+
+    happened: Bool[Array, ""]
+    time: Float[Array, ""]
+    entry: Int[Array, ""]
+
+    def codes(self, counts: tuple[int, int, int, int]) -> list[tuple[Any, Any]]:
+        """Cases of the result, for `first_of`; `counts` as of `Conditions`."""
+        codes: Any = RESULTS
+        names = codes.contact_lost, codes.joint_limit_passed, codes.control_singular, codes.event_occurred
+        return [(self._within(counts, i), code) for i, code in enumerate(names)]
+
+    def _within(self, counts, kind: int) -> Bool[Array, ""]:
+        first = sum(counts[:kind])
+        return self.happened & (self.entry >= first) & (self.entry < first + counts[kind])
+
+    def stats(self, conditions: Conditions, counts: tuple[int, int, int, int]) -> dict[str, Array]:
+        """Index of the contact that was lost, entry of q whose limit was passed, terminal event, each -1 for none."""
+        # The lower limits of all entries come before the upper ones: both belong to the entry modulo their number.
+        names = {"lost_contact": (0, counts[0]), "passed_limit": (1, counts[1] // 2), "terminal_event": (3, counts[3])}
+        return {
+            name: jnp.where(self._within(counts, kind), (self.entry - sum(counts[:kind])) % size, -1).astype(jnp.int32)
+            for name, (kind, size) in names.items()
+            if conditions[kind]
+        }
+
+
+def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violation:
+    """First negative allowance, from those at the save points and at the event that ended a step.
+
+    `within` is None, or whether there was such an event, its time and the allowances (k,) there.
+    """
+    below = reached & (rows < 0).any(1)
+    # The first true flag; zero without any, where `happened` is false.
+    first = jnp.argmax(below)
+    violation = Violation(below.any(), ts[first], jnp.argmin(rows[first]).astype(jnp.int32))
+    if within is not None:
+        happened, time, margins = within
+        # A singular basis may have ended the step too: then no margin is near zero.
+        happened = happened & (jnp.min(margins) <= jnp.finfo(rows.dtype).eps ** 0.25 * (1 + jnp.max(jnp.abs(margins))))
+        located = Violation(happened, time, jnp.argmin(margins).astype(jnp.int32))
+        earlier = happened & ~(violation.happened & (violation.time <= time))
+        violation = jax.tree.map(lambda a, b: jnp.where(earlier, a, b), located, violation)
+    return violation._replace(entry=jnp.where(violation.happened, violation.entry, -1))
+
+
+def report_limits(scene: Scene, solution: Solution, is_concrete: bool) -> Solution:
+    """Add `stats["passed_limit"]` to a solution; a concrete one that passes a limit warns, a traced one does not."""
+    model: Any = scene.system
+    margins = jax.vmap(limit_allowances, (None, 0))(model, solution.q)
+    # Rows that the run did not reach are NaN.
+    below = jnp.isfinite(solution.q).all(1) & (margins < 0).any(1)
+    entry = jnp.argmin(margins[jnp.argmax(below)]) % (margins.shape[1] // 2)
+    entry = jnp.where(below.any(), entry, -1).astype(jnp.int32)
+    if is_concrete and int(entry) >= 0:
+        first, joint = int(np.argmax(np.asarray(margins < 0).any(1))), joint_of(model, int(entry))
+        lower, upper, q = (float(np.asarray(x)[int(entry)]) for x in (model.lower, model.upper, solution.q[first]))
+        side, limit = ("lower", lower) if q - lower < upper - q else ("upper", upper)
+        words = (
+            f"joint {joint!r} is at {q:.6g}, its {side} limit is {limit:.6g}, at t = {float(solution.ts[first]):.6g} s"
+        )
+        warnings.warn(
+            f"{words}; the motion continues (jd.events.JointLimit() ends it there)", JointLimitWarning, stacklevel=3
+        )
+    return eqx.tree_at(lambda s: s.stats, solution, solution.stats | {"passed_limit": entry})

@@ -25,9 +25,8 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.constraints.rank import check_tolerance
-from jaxdyn.constraints.redundancy import most_opening, opening_of_redundant, residual_of_redundant
+from jaxdyn.constraints.redundancy import most_opening, opening_of_redundant, openness, residual_of_redundant
 from jaxdyn.constraints.selection import most_rounding
-from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, state_dtype

@@ -25,14 +25,14 @@ from jaxdyn.simulation.checks import (
     safe_inputs,
 )
 from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, at_save_point, equations
+from jaxdyn.simulation.events import Conditions, Violation, first_violation
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
-from jaxdyn.simulation.options import Options, is_step_length
+from jaxdyn.simulation.options import Options, is_backsolve, is_step_length
 from jaxdyn.simulation.solution import RESULTS, Solution, invalidate_failures, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
 from jaxdyn.simulation.solvers.choice import choose_adjoint, choose_solver, is_split, label
-from jaxdyn.simulation.solvers.differentiable import COUNTS
-from jaxdyn.simulation.terminal_events import Conditions, Violation, check_conditions, first_violation
+from jaxdyn.simulation.solvers.integrator import COUNTS
 from jaxdyn.systems.scene import Scene, check_callback
 from jaxdyn.systems.system import displace, has_dependent_coordinates
 
@@ -173,7 +173,7 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
     conditions = Conditions(at_contacts, at_limits, controls.can_end(control, *start), len(options.terminals))
     for one in options.terminals:
         check_callback(one.function, "Terminal: function", "function(q, v, t)", *start)
-    check_conditions(conditions, options.adjoint)
+    _check_conditions(conditions, options.adjoint)
     eqs, args = equations(scene, control, method, entries, *start, conditions, options.terminals)
     # Shapes that do not fit are reported here, with the user's function at the end of the traceback.
     eqx.filter_eval_shape(eqs.generalized_force, args, entries, *start)
@@ -182,6 +182,16 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
         y0 = y0 | {KEPT: rows_of(scene, start[0].dtype)}
     y0 = y0 | {"work": jnp.zeros((), start[0].dtype)} if "work" in options.outputs else y0
     return _Run(scene, control, method, eqs, args), y0
+
+
+def _check_conditions(conditions: Conditions, adjoint) -> None:
+    """Refuse an adjoint that does not go back through the event that may end a run."""
+    if any(conditions) and is_backsolve(adjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which does not go back through events, and contacts, limits, a terminal event or the "
+            "control may end the run; take 'reverse', or jd.events.ContactLost(stop=False), no other events and a control "
+            "without `allowance`"
+        )
 
 
 def _solver(run: _Run, y0, solver):

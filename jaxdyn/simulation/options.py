@@ -1,25 +1,82 @@
 """Options of a run as users give them, without diffrax, whose import takes longer than a run from stored programs."""
 
+import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.typing import ArrayLike
 
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.model.arguments import batch_hint
-from jaxdyn.simulation.events import Terminal
+from jaxdyn.model.arguments import Numbers, batch_hint
 
 if TYPE_CHECKING:
     import diffrax
 
-    from jaxdyn.simulation.solvers.fixed_steps import Stepper
+    from jaxdyn.simulation.solvers.diffrax_methods import Stepper
 
     Solver = diffrax.AbstractSolver | Stepper | None
     Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
     Adjoint = str | diffrax.AbstractAdjoint | None
 else:
     Solver = Stepsize = Adjoint = Any  # `choose_solver` and `choose_adjoint` check them
+
+
+class Steps(eqx.Module):
+    """Steps of a run: their length, or the tolerances that adaptive ones keep, and how many there may be.
+
+    - `size`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
+    - `rtol`, `atol`: local error of a step, relative to the size of each entry of (q, v), and absolute; by default 1e-8. Values
+      below ten times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
+    - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
+      4096 with `adjoint="direct"`, and where derivatives go through adaptive steps: the end of each one is recorded, 8 bytes a
+      step and trajectory.
+
+    ```python
+    jd.simulate(model, q0, v0, ts, stepsize=jd.Steps(rtol=1e-10, atol=1e-12))
+    jd.simulate(model, q0, v0, ts, stepsize=jd.Steps(0.01, max_steps=1000))
+    ```
+    """
+
+    size: Stepsize = None
+    rtol: Numbers | None = eqx.field(default=None, kw_only=True)
+    atol: Numbers | None = eqx.field(default=None, kw_only=True)
+    max_steps: int | None = eqx.field(static=True, default=None, kw_only=True)
+
+    @classmethod
+    def of(cls, stepsize: Any) -> "Steps":
+        """Steps that the argument `stepsize` of `simulate` stands for."""
+        return stepsize if isinstance(stepsize, Steps) else cls(stepsize)
+
+
+class Pose(NamedTuple):
+    """Output of `simulate`: the pose (nt, 4, 4) of a frame of the model, in `Solution.poses` by its name."""
+
+    frame: str
+
+    def __str__(self) -> str:
+        return POSE + self.frame
+
+
+POSE = "pose:"  # prefix of names of poses, in descriptions and in files
+# Names of what `Steps` holds, which were arguments of `simulate`.
+FORMER_STEPS = {"rtol", "atol", "max_steps"}
+
+
+def pack_steps(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of `simulate` by their names, with those of `Steps` in one."""
+    given = {name: value for name, value in options.items() if name in FORMER_STEPS}
+    if not given:
+        return options
+    rest = {name: value for name, value in options.items() if name not in given}
+    return rest | {"stepsize": dataclasses.replace(Steps.of(rest.get("stepsize")), **given)}
+
+
+def as_output(name: str | Pose) -> str | Pose:
+    """Output by its name, "pose:<frame>" as a `Pose`."""
+    return Pose(name.removeprefix(POSE)) if isinstance(name, str) and name.startswith(POSE) else name
+
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
 
@@ -34,12 +91,12 @@ class Options(NamedTuple):
 
     solver: Any
     adjoint: Any
-    outputs: tuple[str, ...]
+    outputs: tuple[str | Pose, ...]
     stops: tuple[bool, bool]
     max_events: int
     progress: bool
     checks_mass: bool
-    terminals: tuple[Terminal, ...] = ()
+    terminals: tuple[Any, ...] = ()
     max_steps: int = 0
     limit_is_given: bool = False
     selects_rows: bool = False
@@ -61,15 +118,6 @@ def is_backsolve(adjoint) -> bool:
     import diffrax
 
     return isinstance(adjoint, diffrax.BacksolveAdjoint)
-
-
-def is_variational(solver) -> bool:
-    """True for the steps of method "variational"."""
-    if solver is None:
-        return False
-    from jaxdyn.simulation.solvers.fixed_steps import Stepper
-
-    return isinstance(solver, Stepper)
 
 
 def check_step_length(stepsize) -> None:

@@ -5,8 +5,9 @@ normalised at the end of every step (`ProjectedSolver`), which keeps the order o
 no such projection.
 """
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,37 +16,77 @@ import numpy as np
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import as_constant, as_numpy_if_known, is_concrete, is_known, is_tracing, once
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype, warn
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.events import (
     Event,
     Watch,
-    accept_former_events,
     check_events,
     check_terminals,
+    events_of,
+    report_limits,
     sort_events,
 )
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
 from jaxdyn.simulation.options import (
     ADJOINTS,
+    FORMER_STEPS,
+    POSE,
     Adjoint,
     Options,
+    Pose,
     Solver,
+    Steps,
     Stepsize,
+    as_output,
     check_step_length,
     check_tolerance,
     is_backsolve,
     is_step_length,
+    pack_steps,
     step_limit,
 )
 from jaxdyn.simulation.solution import Solution, raise_failure
 from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
+F = TypeVar("F", bound=Callable)
+_FORMER_EVENTS = {"contacts", "limits", "max_events", "progress"}
 
-@accept_former_events
+
+def _accept_former_arguments(function: F) -> F:
+    """Decorator of `simulate`: forms of the release before warn, with the new form."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        if not _FORMER_EVENTS.isdisjoint(options):
+            given = {name: options.pop(name) for name in sorted(_FORMER_EVENTS & set(options))}
+            former = events_of(**given)
+            options["events"] = [*options.get("events", ()), *former]
+            _warn(given, "events", f"[{', '.join(f'jd.events.{one!r}' for one in former)}]")
+        if not FORMER_STEPS.isdisjoint(options):
+            given = {name: options[name] for name in sorted(FORMER_STEPS & set(options))}
+            size = [] if options.get("stepsize") is None else ["stepsize"]
+            options = pack_steps(options)
+            _warn(given, "stepsize", f"jd.Steps({', '.join([*size, *(f'{name}=...' for name in given)])})")
+        outputs = options.get("outputs", ())
+        if not isinstance(outputs, str) and any(isinstance(x, str) and x.startswith(POSE) for x in outputs):
+            options["outputs"] = tuple(map(as_output, outputs))
+            given = {"outputs": tuple(x for x in outputs if x not in options["outputs"])}
+            _warn(given, "outputs", f"({', '.join(f'jd.simulation.{as_output(x)!r}' for x in given['outputs'])},)")
+        return function(*args, **options)
+
+    return cast(F, call)
+
+
+def _warn(given: dict[str, Any], name: str, new: str) -> None:
+    old = ", ".join(f"{name}={value!r}" for name, value in given.items())
+    warn(f"simulate({old}) is now simulate({name}={new})", DeprecationWarning)
+
+
+@_accept_former_arguments
 def simulate(
     scene: SceneLike,
     q0: Numbers,
@@ -55,13 +96,10 @@ def simulate(
     control: Control = None,
     method: str | Method = "auto",
     solver: Solver = None,
-    stepsize: Stepsize = None,
-    rtol: Numbers | None = None,
-    atol: Numbers | None = None,
+    stepsize: Stepsize | Steps = None,
     adjoint: Adjoint = None,
-    outputs: Sequence[str] = (),
+    outputs: Sequence[str | Pose] = (),
     events: Sequence[Event] = (),
-    max_steps: int | None = None,
     throw: bool | None = None,
 ) -> Solution:
     r"""Integrate the equations of motion from (q0, v0) and save the motion at the times `ts`.
@@ -96,30 +134,26 @@ def simulate(
       the scene's forces in the acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps;
       for adaptive ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at
       the start says that explicit steps would have to be shorter than a thousandth of the time.
-    - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
-    - `rtol`, `atol`: local error of a step, relative to the size of each entry of (q, v), and absolute; by default 1e-8. Values
-      below ten times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
+    - `stepsize`: None for adaptive steps with tolerances of 1e-8, a number (s) for fixed ones, a diffrax step-size controller,
+      or `jd.Steps(size, rtol, atol, max_steps)`, which sets tolerances and limits too.
     - `adjoint`: how derivatives are computed.
 
         - "reverse" (default): reverse mode with checkpoints, and Hessians over it.
         - "forward": `jax.jvp`, `jax.jacfwd`, and Hessians by forward over forward mode.
-        - "direct": both modes, at a cost that grows with `max_steps`.
+        - "direct": both modes, at a cost that grows with `Steps.max_steps`.
         - "backsolve": the continuous adjoint, whose gradients are approximate, of runs that no event can end.
         - a diffrax adjoint: diffrax makes the steps.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
       of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces" (N, by the names of contacts: two components of friction, then
       the normal force), "contact_margins", "torque" (of the control, behind drives and limits), "control_state" (of a
-      controller), "drive_state" (of drives) and `"pose:<frame>"`. They are computed only if asked for.
+      controller), "drive_state" (of drives), and `jd.simulation.Pose(frame)`. They are computed only if asked for.
     - `events`: objects of `jd.events`, each kind at most once: `ContactLost` (of a scene with `cones`, whose contacts end the run
       where they are lost unless `ContactLost(stop=False)` is listed), `JointLimit` (without it limits are ignored),
       `ModeSwitches(max_events)` (of forces with modes or pieces), and any number of `Terminal(function)`, which end the run where
       a function of the state falls below zero; `Progress()` shows a meter. Scenes with forces that have modes
       (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`) take explicit methods with adaptive or fixed steps, which end at
       events.
-    - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
-      4096 with "direct", and where derivatives go through adaptive steps: the end of each one is recorded, 8 bytes a step
-      and trajectory.
     - `throw`: raise when the integration fails. Default: yes if all inputs are concrete, else see `Solution.result`.
 
     **Returns:** a `Solution`. Save points between steps come from the method's dense output. Where that is less
@@ -136,6 +170,8 @@ def simulate(
     """
     scene, control = as_scene(scene), controls.as_control(control)
     watch, terminals = sort_events(events)
+    steps = Steps.of(stepsize)
+    stepsize, rtol, atol, max_steps = steps.size, steps.rtol, steps.atol, steps.max_steps
     arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
     method, modal = choose_method(scene, method), has_modes(scene)
     concrete = is_known(scene, control, method, arrays, stepsize, terminals)
@@ -166,8 +202,6 @@ def simulate(
         whole = as_constant(scene) if not is_tracing() and is_concrete(scene) and not is_given(scene) else scene
         solution = smooth_motion(whole, control, method, numbers, options)
     if watch.limits is not None and not watch.limits.stop:
-        from jaxdyn.simulation.terminal_events import report_limits
-
         solution = report_limits(scene, solution, concrete)
     throw = concrete if throw is None else check_flag(throw, "throw")
     if throw and concrete:
@@ -268,8 +302,8 @@ def _choose(
 
         solver = choose_solver(solver, stepsize)
         adjoint = choose_adjoint(adjoint, solver)
-    checks.check_drives(scene, control, solver, modal)
-    checks.check_combination(control, method, solver, adjoint)
+    checks.check_drives(scene, control, method, modal)
+    checks.check_combination(control, method, adjoint)
     if modal:
         checks.check_contacts(scene)
         checks.check_modal_options(control, stepsize, solver, adjoint, outputs)

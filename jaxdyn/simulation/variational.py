@@ -309,7 +309,7 @@ class Variational(Multipliers):
                 f"stepsize is {stepsize!r}; method 'variational' takes fixed steps, because adaptive ones lose its "
                 "conservation: pass a number (s), e.g. stepsize=0.01"
             )
-        from jaxdyn.simulation.solvers.fixed_steps import Stepper
+        from jaxdyn.simulation.solvers.diffrax_methods import Stepper
 
         return Stepper()
 

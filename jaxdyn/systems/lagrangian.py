@@ -130,7 +130,7 @@ class LagrangianSystem(System):
         place = describe_state(q, t, v)
         # First, since an index beyond nq is clamped by JAX and would give a finite L of wrong coordinates.
         self._check_coordinates(q, v, t)
-        value, rest, mass, shifted = (np.asarray(x, float) for x in _probe_compiled(self, q, v, t))
+        value, rest, mass, shifted = (np.asarray(x, float) for x in _probe(self, q, v, t))
         if not np.isfinite(value):
             raise ValueError(f"lagrangian is {value} at {place}; start where it is finite, or write it without a pole")
         # Relative to the largest term: rounding of L at rest is not a kinetic term.
@@ -162,11 +162,9 @@ class LagrangianSystem(System):
             return  # it needs arrays of jax (`.at`, or their dtypes), so that its coordinates cannot be checked
 
 
+@eqx.filter_jit
 def _probe(system: LagrangianSystem, q, v, t):
     """Values for the checks of a start: L, L without the potential at rest, and d2L/dv2 at v = 0 and at v + 1."""
     hessian = jax.jacfwd(system._momentum, argnums=1)
     zero = jnp.zeros_like(v)
     return system.value(q, v, t), system._lagrangian_value(q, zero, t), hessian(q, zero, t), hessian(q, v + 1, t)
-
-
-_probe_compiled = eqx.filter_jit(_probe)

@@ -1,5 +1,6 @@
-"""Scenes: one system with its constraints and forces. Only listed items are compiled."""
+"""Scenes: one system with its constraints and forces, and drives with a state. Only listed items are compiled."""
 
+import abc
 import functools
 import inspect
 import types
@@ -15,7 +16,6 @@ from jaxtyping import Array, Float, PyTree
 from jaxdyn.compile.known import is_concrete, is_tracing
 from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system
 from jaxdyn.model.description import scene_lines
-from jaxdyn.systems.drives import DriveDynamics, pass_command
 
 if TYPE_CHECKING:
     Force = Callable[[Any, Array, Array, Array], Array]  # f(system, q, v, t) -> (nv,)
@@ -87,7 +87,7 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
     if not callable(function):
         raise ValueError(f"{argument} is {function!r}, which cannot be called; pass a function or a callable Module")
     if takes:
-        _check_arguments(function, argument, takes)
+        _check_call(function, argument, f"({takes})", takes.split(", "))
     if not jax.tree_util.all_leaves([function]):
         return function
     # A bound method hides its object; a Partial keeps the object's leaves visible to transformations.
@@ -261,16 +261,16 @@ def check_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Float[
     return as_array(value, argument, q.dtype)
 
 
-def _check_arguments(function: Any, argument: str, takes: str) -> None:
+def _check_call(function: Any, name: str, call: str, args: Sequence[Any]) -> None:
+    """Refuse a function that cannot be called with so many arguments, `call` in words."""
     try:
-        signature = inspect.signature(function.function if isinstance(function, _Static) else function)
+        taken = inspect.signature(function.function if isinstance(function, _Static) else function)
     except (TypeError, ValueError):  # functions not written in Python have no signature
         return
     try:
-        # The names are placeholders: `bind` checks the number of arguments only.
-        signature.bind(*takes.split(", "))
+        taken.bind(*args)
     except TypeError as error:
-        raise ValueError(f"{argument} takes {signature}, but is called as ({takes}); {error}") from None
+        raise ValueError(f"{name} takes {taken}, but is called as {call}; {error}") from None
 
 
 def check_callback(function: Callable, name: str, signature: str, *args, first: tuple = ()) -> None:
@@ -278,15 +278,7 @@ def check_callback(function: Callable, name: str, signature: str, *args, first: 
 
     **Raises:** ValueError for a function with other arguments, and for one that needs the values of its arguments.
     """
-    try:
-        taken = inspect.signature(function.function if isinstance(function, _Static) else function)
-    except (TypeError, ValueError):  # functions not written in Python have no signature
-        taken = None
-    try:
-        if taken is not None:
-            taken.bind(*first, *args)
-    except TypeError as error:
-        raise ValueError(f"{name} takes {taken}, but is called as {signature}; {error}") from None
+    _check_call(function, name, signature, (*first, *args))
     try:
         # Abstract evaluation finds branches on traced values before a long compilation fails with a message about the
         # loop.
@@ -304,3 +296,86 @@ def _sequence(items, argument: str) -> tuple:
     if not isinstance(items, (tuple, list)):
         raise ValueError(f"{argument} is a {type(items).__name__}; pass a tuple or a list, e.g. {argument}=(item,)")
     return tuple(items)
+
+
+# Drives between a control and the joints: torque laws with a state, and the chain of a scene's drives and limits.
+
+
+class DriveDynamics(eqx.Module):
+    r"""Base class of drives with a state z, between the command of a control and the torque at the joints.
+
+    $$\tau = \mathrm{torque}(q, v, t, z, u), \quad \dot z = \mathrm{rate}(q, v, t, z, u)$$
+
+    List one among the forces of a `Scene`. Drives and `jd.forces.EffortLimits` act in the order of the list, each on what the one
+    before gives. `jd.simulate` integrates z with the motion; `jd.stepper` takes and returns it as a third entry of the
+    state. Functions of one instant (`jd.constrained_dynamics`, `jd.inverse_dynamics`, ...) know torques at the joints alone.
+
+    ```python
+    class VoltageDrive(jd.forces.DriveDynamics):  # L di/dt = u - R i - k v, tau = k i
+        inductance: jax.Array
+        resistance: jax.Array
+        constant: jax.Array
+
+        def start(self, system, q, v, t):
+            return jnp.zeros_like(v)
+
+        def torque(self, system, q, v, t, state, command):
+            return self.constant * state
+
+        def rate(self, system, q, v, t, state, command):
+            return (command - self.resistance * state - self.constant * v) / self.inductance
+    ```
+    """
+
+    @abc.abstractmethod
+    def start(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " n"]:
+        """The state (n,) at the start of a motion."""
+
+    @abc.abstractmethod
+    def torque(
+        self,
+        system: SystemLike,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " n"],
+        command: Float[Array, " nv"],
+    ) -> Float[Array, " nv"]:
+        """Torque (nv,) behind the drive, N m or N."""
+
+    @abc.abstractmethod
+    def rate(
+        self,
+        system: SystemLike,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " n"],
+        command: Float[Array, " nv"],
+    ) -> Float[Array, " n"]:
+        """Rate of the state, (n,)."""
+
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
+        """Zeros (nv,): a drive acts on the command, not beside it."""
+        return jnp.zeros_like(v)
+
+
+def pass_command(force: Any, system: Any, q, v, t, command, state):
+    """Torque (nv,) behind one force of a scene's list, the rate of its state or None, and the states of the forces after it."""
+    if isinstance(force, DriveDynamics):
+        # Shapes alone: the size of a drive's state needs no computation of its start.
+        count = eqx.filter_eval_shape(force.start, system, q, v, t).shape[0]
+        # The states of all drives form one vector, in the order of the scene's forces.
+        own = state[:count]
+        return (
+            force.torque(system, q, v, t, own, command),
+            force.rate(system, q, v, t, own, command),
+            state[count:],
+        )
+    if hasattr(force, "clip_effort"):
+        command = force.clip_effort(system, command, v=v)
+    return command, None, state

@@ -267,6 +267,11 @@ def has_dependent_coordinates(system) -> bool:
     return isinstance(system, Model) and system.nq > system.topology.nq
 
 
+def has_coordinate_rates(system) -> bool:
+    """Decide whether v = dq/dt: velocities of planar, spherical and free joints are twists, or in axes that move."""
+    return not (isinstance(system, Model) and {"planar", "spherical", "free"} & set(system.topology.kinds))
+
+
 def needs_retraction(system) -> bool:
     """Decide whether `retract` changes anything."""
     return has_quaternions(system) or has_dependent_coordinates(system)

@@ -17,6 +17,7 @@ from jaxdyn.identify.torque_terms import coulomb_through_filter
 from jaxdyn.io import read_torque_terms
 from jaxdyn.io.logs import read_log, write_log
 
+GIVEN = "--v-s 0.01 --prior 1 --robust none"
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
 
 
@@ -62,21 +63,6 @@ def arrays_of(path):
         return dict(archive)
 
 
-def test_help_names_units_columns_and_examples(capsys):
-    for command, words in {
-        "info": ("rad", "kg", "--repair"),
-        "simulate": ("N m", "tau1", "--torque gravity"),
-        "identify": ("tau1", "--lock", "--cutoff"),
-    }.items():
-        with pytest.raises(SystemExit) as stop:
-            main([command, "--help"])
-        assert stop.value.code == 0
-        text = capsys.readouterr().out
-        assert "examples:" in text
-        for word in words:
-            assert word in text
-
-
 def test_info_shows_the_robot_and_its_faults(arm, capsys):
     assert main(["info", str(arm)]) == 0
     text = capsys.readouterr().out
@@ -92,7 +78,7 @@ def test_info_locks_floats_and_repairs(arm, tmp_path, capsys):
     out = tmp_path / "repaired.urdf"
     assert main(["info", str(arm), "--lock", "lift=0.1", "--repair", str(out)]) == 0
     assert "2 degrees of freedom" in capsys.readouterr().out
-    repaired = jd.load_urdf(out)
+    repaired = jd.load_model(out)
     assert jd.model.inertia_report(repaired) == []
     np.testing.assert_allclose(repaired.inertias[:, 0].sum(), 4.5, rtol=1e-12)
     # The inertia of a base that is fixed to the world is not in the model, nor in the file: such a base cannot float.
@@ -105,7 +91,6 @@ def test_info_of_a_real_robot_says_what_is_not_used(panda, capsys):
     assert main(["info", str(panda)]) == 0
     text = capsys.readouterr().out
     assert "panda_hand_tcp" in text
-    assert "11 <visual>" in text
     assert "<mimic>" in text
 
 
@@ -118,7 +103,7 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, tmp_path, cap
     drift = float(text.split("at most ")[1].split(" J")[0])
     assert drift < 1e-7
     columns = columns_of(out)
-    model = jd.load_urdf(arm)
+    model = jd.load_model(arm)
     names = [f"{signal}_{joint}" for signal in ("q", "v", "tau") for joint in model.joint_names]
     assert [name.partition(" [")[0] for name in columns] == ["t", *names, "energy", "work"]
     log = read_log(out, joint_names=model.joint_names)
@@ -187,7 +172,7 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, c
     assert report["samples"] == {"train": 1744, "test": 748, "final": 2492}
 
     # What was written is what was fitted to all samples: bodies that exist, and with the offsets of the report the same torques.
-    fitted = jd.load_urdf(out)
+    fitted = jd.load_model(out)
     assert jd.model.inertia_report(fitted) == []
     log = jd.identify.from_raw(t, q, tau, trim=38 * 8)  # as the command does
     x = jd.identify.nominal_parameters(fitted)
@@ -258,7 +243,7 @@ def simulated_logs(model, folder, seeds, noise=0.0, delay=0.0, gains=1.0):
 @pytest.mark.long
 def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsys):
     """Raw logs of a motion up to 0.5 Hz, torques that vibrate at 9 Hz."""
-    model = jd.model.repair_inertias(jd.load_urdf(arm))
+    model = jd.model.repair_inertias(jd.load_model(arm))
     paths = []
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -272,8 +257,8 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsy
         paths.append(str(tmp_path / f"{seed}.csv"))
         write_log(paths[-1], jd.identify.Log(t, q, tau=tau))
     report = tmp_path / "fit.json"
-    args = ["identify", "--urdf", str(arm), "--log", paths[0], "--test-log", paths[1], "--report", str(report)]
-    args += ["--repair", "--terms", "viscous", "--v-s", "0.01", "--prior", "1", "--robust", "none"]
+    args = f"identify --urdf {arm} --log {paths[0]} --test-log {paths[1]} --report {report}".split()
+    args += f"--repair --terms viscous {GIVEN}".split()
     assert main(args) == 0
     text = capsys.readouterr().out
     assert re.search(r"--cutoff auto: 5(\.\d+)? Hz, ten times the band of the motion, 0.5", text)
@@ -292,26 +277,12 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsy
 @pytest.mark.long
 def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     """Two logs fitted, one only predicted; JSON, page and URDF; what is not asked for is not tried."""
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     a, b, c = simulated_logs(truth, tmp_path, (0, 1, 2), noise=0.01)
     out, page, report = (tmp_path / name for name in ("fitted.urdf", "fit.html", "fit.json"))
     wrong = tmp_path / "wrong.urdf"
     jd.save_urdf(truth.replace(inertias=1.2 * truth.inertias), wrong)
-    args = [
-        "identify",
-        "--urdf",
-        str(wrong),
-        "--log",
-        a,
-        b,
-        "--test-log",
-        c,
-        "--terms",
-        "viscous",
-        "coulomb",
-        "quadratic",
-    ]
-    args += ["--v-s", "0.01", "--prior", "1", "--robust", "none"]
+    args = f"identify --urdf {wrong} --log {a} {b} --test-log {c} --terms viscous coulomb quadratic {GIVEN}".split()
     args += ["--out", str(out), "--report", str(report), "--html", str(page)]
     assert main(args) == 0
     text = capsys.readouterr().out
@@ -326,7 +297,7 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     # Quadratic and viscous friction explain the same torque in part.
     assert set(sources.values()) <= {"data", "prior", "bound", "confounded"}
     assert all(name.endswith(("viscous", "coulomb", "quadratic")) for name, x in sources.items() if x == "confounded")
-    assert jd.model.inertia_report(jd.load_urdf(out)) == []
+    assert jd.model.inertia_report(jd.load_model(out)) == []
     # Nothing outside of the page: names of XML are the only addresses.
     text = page.read_text()
     assert "<svg" in text and text.count("http") == text.count("http://www.w3.org/")
@@ -335,7 +306,7 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
 
 def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys, monkeypatch):
     """Options of a file, overruled by the command line; Pinocchio and MuJoCo read the URDF, we its offsets and terms too."""
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     simulated_logs(truth, tmp_path, (0, 1, 2), noise=0.01)
     jd.save_urdf(truth, tmp_path / "true.urdf")
     monkeypatch.chdir(tmp_path)
@@ -358,7 +329,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys, m
     assert {torques[name]["v_s"] for name in truth.joint_names} == {0.02}
     assert [torques[name]["quadratic"] for name in truth.joint_names] == computed["extra_terms"]["quadratic"]
     read = pinocchio.buildModelFromUrdf(str(tmp_path / "fitted.urdf"))
-    fitted = jd.load_urdf(tmp_path / "fitted.urdf")
+    fitted = jd.load_model(tmp_path / "fitted.urdf")
     np.testing.assert_allclose(read.friction, fitted.friction, rtol=1e-12)
     np.testing.assert_allclose(read.damping, fitted.damping, rtol=1e-12)
     body = mujoco.MjModel.from_xml_path(str(tmp_path / "fitted.urdf"))
@@ -401,7 +372,7 @@ def test_files_of_options_are_refused(text, error, tmp_path, monkeypatch, capsys
 @pytest.mark.long
 def test_identify_finds_delays(arm, tmp_path, capsys, monkeypatch):
     """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     jd.save_urdf(truth, tmp_path / "true.urdf")
     simulated_logs(truth, tmp_path, (0, 1), noise=0.005, delay=0.02)
     held = truth.replace(inertias=truth.inertias.at[-1].add(jd.inertia.sphere(0.7, 0.05)))
@@ -439,12 +410,11 @@ def test_identify_finds_delays(arm, tmp_path, capsys, monkeypatch):
 
 
 def test_identify_repairs_a_link_of_zero_inertia(arm, tmp_path, capsys):
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
     path = tmp_path / "zero.urdf"
     jd.save_urdf(truth.replace(inertias=truth.inertias.at[1, 4:].set(0.0).at[2].set(0.0)), path)
-    args = ["identify", "--urdf", str(path), "--log", a, "--test-log", b, "--terms", "viscous", "coulomb"]
-    args += ["--v-s", "0.01", "--prior", "1", "--robust", "none"]
+    args = f"identify --urdf {path} --log {a} --test-log {b} --terms viscous coulomb {GIVEN}".split()
     assert main(args) == 2
     assert "moves no inertia" in capsys.readouterr().err
     assert main([*args, "--repair"]) == 0
@@ -452,7 +422,7 @@ def test_identify_repairs_a_link_of_zero_inertia(arm, tmp_path, capsys):
 
 
 def test_identify_a_payload(arm, tmp_path, capsys):
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     path, report = tmp_path / "true.urdf", tmp_path / "fit.json"
     jd.save_urdf(truth, path)
     held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
@@ -461,8 +431,8 @@ def test_identify_a_payload(arm, tmp_path, capsys):
     loaded = simulated_logs(
         truth.replace(inertias=truth.inertias.at[-1].add(held)), tmp_path / "loaded", (2,), noise=0.01
     )
-    args = ["identify", "--urdf", str(path), "--log", *empty, "--payload-log", *loaded, "--report", str(report)]
-    args += ["--terms", "viscous", "coulomb", "--v-s", "0.01", "--prior", "1", "--robust", "none"]
+    args = f"identify --urdf {path} --report {report} --terms viscous coulomb {GIVEN}".split()
+    args += ["--log", *empty, "--payload-log", *loaded]
     assert main(args) == 0
     assert f"Payload on {truth.body_names[-1]}" in capsys.readouterr().out
     computed = json.loads(report.read_text())["payload"]
@@ -475,7 +445,7 @@ def test_identify_a_payload(arm, tmp_path, capsys):
 @pytest.mark.long
 def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys):
     """Currents of three drives; what is written is then the robot in newton metres."""
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     jd.save_urdf(truth, tmp_path / "true.urdf")
     held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
     (tmp_path / "held").mkdir()
@@ -505,24 +475,12 @@ def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys
 
 @pytest.mark.long
 def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
     path = tmp_path / "true.urdf"
     jd.save_urdf(truth, path)
-    args = [
-        "identify",
-        "--urdf",
-        str(path),
-        "--log",
-        a,
-        b,
-        "--prior",
-        "1",
-        "--progress",
-        "--html",
-        str(tmp_path / "x.html"),
-    ]
-    assert main(args) == 0
+    command = f"identify --urdf {path} --log {a} {b} --prior 1 --progress --html {tmp_path / 'x.html'}"
+    assert main(command.split()) == 0
     text = capsys.readouterr().out
     assert "chosen over" in text and "held out:" in text and "The written robot was then fitted to all" in text
     assert "A.csv (last 30 %)" in text and "B.csv (last 30 %)" in text
@@ -530,27 +488,18 @@ def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):
 
 def test_identify_recovers_a_simulated_arm(arm, tmp_path, capsys):
     """Noise-free samples at 100 Hz, filtered beforehand: the true base parameters come back."""
-    truth = jd.load_urdf(arm)
-    rng = np.random.default_rng(0)
-    t = np.linspace(0, 4, 401)
-    size, rate, phase = rng.uniform(0.2, 0.5, (3, 3)), rng.uniform(1, 4, (3, 3)), rng.uniform(0, 6, (3, 3))
-    angle = rate * t[:, None, None] + phase
-    q, v, a = (
-        np.sum(x, 1) for x in (size * np.sin(angle), size * rate * np.cos(angle), -size * rate**2 * np.sin(angle))
-    )
-    rows = jd.identify.regressor(truth, q, v, a)
-    x = jd.identify.nominal_parameters(truth)
-    path = tmp_path / "log.csv"
-    write_log(path, jd.identify.Log(t, q, v, a, rows @ x))
+    truth = jd.load_model(arm)
+    (path,) = simulated_logs(truth, tmp_path, (0,))
     wrong = tmp_path / "wrong.urdf"
     inertias = np.array(truth.inertias)
     inertias[:, :4] *= 1.2
     jd.save_urdf(truth.replace(inertias=inertias), wrong)
-    args = ["identify", "--urdf", str(wrong), "--log", str(path), "--method", "least-squares"]
+    args = ["identify", "--urdf", str(wrong), "--log", path, "--method", "least-squares"]
     assert main([*args, "--report", str(tmp_path / "report.json")]) == 0
     capsys.readouterr()
     report = json.loads((tmp_path / "report.json").read_text())
     base = jd.identify.base_parameters(truth, jd.identify.TERMS)
+    x = jd.identify.nominal_parameters(truth)
     np.testing.assert_allclose(report["base_parameters"]["fitted"], base.values(x), rtol=1e-8, atol=1e-8)
 
 
@@ -558,7 +507,7 @@ def test_identify_recovers_a_simulated_arm(arm, tmp_path, capsys):
 def test_identify_by_trajectory_from_a_log_taken_as_filtered(arm, tmp_path, capsys):
     """A log that the command line itself simulated, accelerations left out: the mass error of a fifth is found."""
     log, wrong, out = tmp_path / "log.csv", tmp_path / "wrong.urdf", tmp_path / "fitted.urdf"
-    model = jd.model.repair_inertias(jd.load_urdf(arm))
+    model = jd.model.repair_inertias(jd.load_model(arm))
     jd.save_urdf(model, tmp_path / "true.urdf")
     jd.save_urdf(model.replace(inertias=1.2 * model.inertias), wrong)
     motion = ["--torque", "gravity+random", "--duration", "3", "--sample", "0.01", "--friction", "0", "--seed", "2"]
@@ -572,63 +521,55 @@ def test_identify_by_trajectory_from_a_log_taken_as_filtered(arm, tmp_path, caps
     assert errors["test_percent"] < 1 < 10 < errors["nominal_test_percent"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["info", "nowhere.urdf"], "nowhere.urdf"),
-        (["info", "ARM", "--lock", "elbow"], "elbow"),
-        (["info", "ARM", "--lock", "lift=high"], "no finite number"),
-        (["info", "ARM", "--repair", "out.txt"], "--repair"),
-        (["simulate", "ARM", "--q0", "1", "2"], "--q0 has 2 numbers"),
-        (["simulate", "ARM", "--v0", "elbow=1"], "elbow"),
-        (["simulate", "ARM", "--torque", "full"], "--torque"),
-        (["simulate", "ARM", "--batch", "4"], "all motions would be the same"),
-        (["simulate", "ARM", "--damping", "-1"], "--damping"),
-        (["simulate", "ARM", "--dt", "0"], "--dt"),
-        (["simulate", "ARM", "--duration", "-1"], "--duration"),
-        (["simulate", "ARM", "--out", "motion.txt"], "--out"),
-        (["simulate", "ARM", "--html", "motion.txt"], "--html"),
-        (["simulate", "ARM", "--torque", "nowhere.csv"], "nowhere.csv"),
-        (["identify", "--urdf", "ARM", "--log", "nowhere.csv"], "nowhere.csv"),
-        (["identify", "--urdf", "ARM", "--log", "SHORT"], "lock"),
-        (["identify", "--urdf", "ARM", "--log", "NAN"], "nan"),
-        (["identify", "--urdf", "ARM", "--log", "BACK"], "time does not increase"),
-        (["identify", "--urdf", "ARM", "--log", "LONG", "--train", "1"], "fraction"),
-        (
-            ["identify", "--urdf", "ARM", "--log", "GOOD", "--method", "least-squares", "--out", "x.urdf"],
-            "least squares",
-        ),
-        (["identify", "--urdf", "ARM", "--log", "GOOD"], "too few"),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "GOOD"], "given twice"),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "--rename", "m1"], "as motor1=shoulder"),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "--test-log", "GOOD"], "a training log is no test of the fit"),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "--terms", "auto", "dahl"], "auto excludes other terms"),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "--v-s", "fast"], "--v-s: 'fast' is no finite number"),
-        (
-            ["identify", "--urdf", "ARM", "--log", "GOOD", "--method", "trajectory", "--terms", "dahl"],
-            "need --method feasible",
-        ),
-        (["identify", "--urdf", "ARM", "--log", "GOOD", "LONG", "--method", "trajectory"], "fits one log"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_status_2(arguments, words, arm, tmp_path, capsys):
-    header = "t,q1,q2,q3,tau1,tau2,tau3\n"
+BAD_INPUT = """
+info nowhere.urdf | nowhere.urdf
+info ARM --lock elbow | elbow
+info ARM --lock lift=high | no finite number
+info ARM --repair out.txt | --repair
+simulate ARM --q0 1 2 | --q0 has 2 numbers
+simulate ARM --v0 elbow=1 | elbow
+simulate ARM --torque full | --torque
+simulate ARM --batch 4 | all motions would be the same
+simulate ARM --damping -1 | --damping
+simulate ARM --dt 0 | --dt
+simulate ARM --duration -1 | --duration
+simulate ARM --out motion.txt | --out
+simulate ARM --html motion.txt | --html
+simulate ARM --torque nowhere.csv | nowhere.csv
+identify --urdf ARM --log nowhere.csv | nowhere.csv
+identify --urdf ARM --log SHORT | lock
+identify --urdf ARM --log NAN | nan
+identify --urdf ARM --log BACK | time does not increase
+identify --urdf ARM --log LONG --train 1 | fraction
+identify --urdf ARM --log GOOD --method least-squares --out x.urdf | least squares
+identify --urdf ARM --log GOOD | too few
+identify --urdf ARM --log GOOD GOOD | given twice
+identify --urdf ARM --log GOOD --rename m1 | as motor1=shoulder
+identify --urdf ARM --log GOOD --test-log GOOD | a training log is no test of the fit
+identify --urdf ARM --log GOOD --terms auto dahl | auto excludes other terms
+identify --urdf ARM --log GOOD --v-s fast | --v-s: 'fast' is no finite number
+identify --urdf ARM --log GOOD --method trajectory --terms dahl | need --method feasible
+identify --urdf ARM --log GOOD LONG --method trajectory | fits one log
+"""
+
+
+@pytest.mark.parametrize("line", BAD_INPUT.strip().splitlines())
+def test_bad_input_is_one_line_and_exit_status_2(line, arm, tmp_path, capsys):
+    arguments, words = line.split(" | ")
+    header, zeros = "t,q1,q2,q3,tau1,tau2,tau3\n", ",0,0,0,0,0,0\n"
     files = {
         "SHORT": "t,q1,tau1\n0,0,0\n1,0,0\n",
-        "NAN": header + "0,0,nan,0,0,0,0\n1,0,0,0,0,0,0\n",
-        "BACK": header + "0,0,0,0,0,0,0\n0,0,0,0,0,0,0\n",
-        "LONG": header + "".join(f"{0.01 * i},0,0,0,0,0,0\n" for i in range(400)),
-        "GOOD": header + "".join(f"{0.01 * i},0,0,0,0,0,0\n" for i in range(20)),
+        "NAN": f"{header}0,0,nan,0,0,0,0\n1{zeros}",
+        "BACK": f"{header}0{zeros}0{zeros}",
+        "LONG": header + "".join(f"{0.01 * i}{zeros}" for i in range(400)),
+        "GOOD": header + "".join(f"{0.01 * i}{zeros}" for i in range(20)),
     }
-    places = {"ARM": str(arm)}
+    places = {"ARM": str(arm)} | {name: str(tmp_path / f"{name.lower()}.csv") for name in files}
     for name, text in files.items():
-        places[name] = str(tmp_path / f"{name.lower()}.csv")
         (tmp_path / f"{name.lower()}.csv").write_text(text)
-    assert main([places.get(argument, argument) for argument in arguments]) == 2
+    assert main([places.get(argument, argument) for argument in arguments.split()]) == 2
     shown = capsys.readouterr().err
-    assert shown.startswith("jaxdyn: ")
-    assert shown.count("\n") == 1
-    assert words in shown
+    assert shown.startswith("jaxdyn: ") and shown.count("\n") == 1 and words in shown
 
 
 def test_debug_shows_where_an_error_arose():
@@ -853,7 +794,7 @@ def test_calibrate(tmp_path, capsys):
         (tmp_path / name).write_text(arm.format(links="".join(links)))
         return str(tmp_path / name)
 
-    nominal, true = write("nominal.urdf", 0.0), jd.load_urdf(write("true.urdf", 0.004))
+    nominal, true = write("nominal.urdf", 0.0), jd.load_model(write("true.urdf", 0.004))
     poses = tmp_path / "poses.csv"
     assert main(["calibrate", nominal, "--frame", "l2", "--choose", "30", "--marker", "--out", str(poses)]) == 0
     header, *rows = poses.read_text().splitlines()
@@ -874,7 +815,7 @@ def test_calibrate(tmp_path, capsys):
     # of a marker beside it would determine.
     assert "error on the 6 poses held out" in text and "24 poses determine" in text
     assert float(text.split("held out: ")[1].split(" mm")[0]) < 0.1
-    fitted = jd.load_urdf(out)
+    fitted = jd.load_model(out)
     assert fitted.joint_names == ("j0", "j1", "j2")
     seen = np.stack(
         [

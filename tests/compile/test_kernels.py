@@ -23,7 +23,7 @@ from jax import lax
 from kernel_helpers import native, quick, refuse
 
 from jaxdyn import compile as backend
-from jaxdyn.compile import derive, disk, evaluate, kernels, known, mode, objects, program, target, trace, trigonometry
+from jaxdyn.compile import derive, disk, evaluate, kernels, known, mode, objects, operations, program, target, trace
 from jaxdyn.compile.code import kernel_ir
 from jaxdyn.compile.expansion import NotNumbers, expand
 from jaxdyn.compile.operations import as_operations
@@ -163,7 +163,7 @@ def test_sine_and_cosine(dtype, most):
     far[0] = far[0] if dtype == jnp.float32 else 6381956970095103 * 2.0**797
     with mpmath.workprec(2500):
         want = [[float(f(mpmath.mpf(float(x)))) for x in far] for f in (mpmath.sin, mpmath.cos)]
-    for got in (both(jnp.asarray(far)), (trigonometry.sine(jnp.asarray(far)), trigonometry.cosine(jnp.asarray(far)))):
+    for got in (both(jnp.asarray(far)), (operations.sine(jnp.asarray(far)), operations.cosine(jnp.asarray(far)))):
         assert np.abs(np.asarray(got, float) - want).max() < 1.1 * eps
     one = jax.jit(native(lambda x: (jnp.sin(x), jnp.cos(x))))
     assert np.abs(np.asarray([one(x) for x in jnp.asarray(far)], float).T - want).max() < 1.1 * eps

@@ -9,9 +9,9 @@ from jax.scipy.linalg import solve_triangular
 from kernel_helpers import assert_close as assert_array_close
 
 from jaxdyn.compile import array_rules, kernel, rolled, sweep
+from jaxdyn.compile.code import find_slots
 from jaxdyn.compile.operations import as_operations
 from jaxdyn.compile.scan import Scan
-from jaxdyn.compile.scan_text import find_slots
 from jaxdyn.compile.trace import program_of
 
 pytestmark = pytest.mark.native

@@ -111,7 +111,7 @@ def test_a_delta_robot_from_a_file_keeps_its_branch(count, tmp_path):
     """The plate held at all points of a grid that are in reach, up to 0.6 m away, from one guess; closed form of the hips."""
     path = tmp_path / "delta.xml"
     path.write_text(delta_file())
-    scene = jd.io.load_mjcf(path)
+    scene = jd.load(path)
     model, guess = scene.system, scene.starts["reference"].q
     assert model.nv == 21 and jd.constraint_jacobian(scene, guess).shape == (18, 21)
     x = np.linspace(-0.6, 0.6, count)

@@ -19,8 +19,8 @@ from jaxdyn.constraints.dynamics import (
     projections,
     second_fundamental_form,
 )
+from jaxdyn.constraints.frames import constraint_forces, constraint_wrenches
 from jaxdyn.constraints.rank import pseudo_inverse
-from jaxdyn.constraints.reactions import constraint_forces, constraint_wrenches
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.model.configuration import difference, integrate

@@ -20,7 +20,7 @@ from jaxdyn.constraints import (
     rolling_sphere,
     rolling_wheel,
 )
-from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, position_residual, rows, velocity_residual
+from jaxdyn.constraints.base import constraint_jacobian, layout, position_residual, rows, velocity_residual
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import configuration_rate, difference, integrate
@@ -288,20 +288,6 @@ def test_names_and_refusals(pair):
     for message, make in made.items():
         with pytest.raises(ValueError, match=message):
             make()
-
-
-def test_former_names_are_taken_with_a_warning():
-    """`slip` of a constraint of one's own is its residual of velocities."""
-    with pytest.warns(DeprecationWarning, match="Mine.slip is called `velocity` now"):
-
-        class Mine(Constraint):
-            name: str = "mine"
-
-            def slip(self, system, q, v, t):
-                return v[:1] - 2.0 * v[1:2]
-
-    system = jd.MetricSystem(lambda q: jnp.eye(2), 2)
-    np.testing.assert_array_equal(jd.constraint_jacobian(jd.Scene(system, (Mine(),)), jnp.zeros(2)), [[1.0, -2.0]])
 
 
 @pytest.mark.parametrize(

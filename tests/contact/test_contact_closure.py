@@ -166,7 +166,7 @@ def test_cuts_that_do_not_reach_the_margin_are_no_answer(monkeypatch):
     cone = friction_cone("hard-finger", mu=2.0)
     G = np.random.default_rng(3).normal(size=(6, 18))
     assert force_closure_of_map(G, [cone] * 6).margin > 1e-3
-    monkeypatch.setattr("jaxdyn.contact.closure._ROUNDS", 1)
+    monkeypatch.setattr("jaxdyn.contact.forces._ROUNDS", 1)
     with pytest.raises(RuntimeError, match="the margin was not found to 1e-09 with 1 rounds"):
         force_closure_of_map(G, [cone] * 6)
 

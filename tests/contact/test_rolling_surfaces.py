@@ -264,7 +264,13 @@ def test_an_egg_keeps_its_energy_and_both_methods_agree():
     ts, ends = jnp.linspace(0.0, 5.0, 26), []
     for method in ("projected", "reduced"):
         solution = jd.simulate(
-            scene, q, v, ts, method=method, rtol=1e-11, atol=1e-11, outputs=("energy", "constraint_residual")
+            scene,
+            q,
+            v,
+            ts,
+            method=method,
+            stepsize=jd.Steps(rtol=1e-11, atol=1e-11),
+            outputs=("energy", "constraint_residual"),
         )
         assert float(solution.constraint_residual.max()) < 1e-13
         np.testing.assert_allclose(solution.energy, solution.energy[0], rtol=1e-9)
@@ -330,7 +336,9 @@ def test_a_valley_that_becomes_too_narrow_ends_the_motion():
     q = scene.system.place(jnp.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]), near=[[0.0, 0.0, -0.5, 0.0]])
     v = jnp.array([1.2, 0.0, 0.0, 0.0, 4.0, 0.0])
     for options in ({}, {"stepsize": 0.005}):
-        solution = jd.simulate(scene, q, v, jnp.linspace(0.0, 0.5, 51), throw=False, max_steps=2000, **options)
+        solution = jd.simulate(
+            scene, q, v, jnp.linspace(0.0, 0.5, 51), throw=False, stepsize=jd.Steps(max_steps=2000), **options
+        )
         assert solution.result == jd.RESULTS.no_single_contact, solution.result
         assert 0 < float(solution.stats["time_reached"]) < 0.5 and np.isnan(solution.q[-1]).all()
 

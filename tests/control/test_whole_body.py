@@ -13,6 +13,7 @@ from jaxdyn import inertia
 
 TS = jnp.linspace(0.0, 2.0, 21)
 BASE = (0, 1, 2)
+FORCES, PRELOADED = (jd.control.GroundForces(preload, passive=BASE) for preload in (0.0, 1.0))
 
 
 def biped_model():
@@ -43,7 +44,7 @@ def law_of(biped, shift=(0.0, 0.0, 0.0), kp=KP, kd=KD, **options):
     model, q, feet, center = biped
     # The attitude of the trunk, whose plane stands upright in the world.
     attitude = jd.frame_pose(model, q, "trunk")[:3, :3]
-    options = {"orientation": attitude, "posture": q, "passive": BASE} | options
+    options = {"orientation": attitude, "posture": q, "forces": FORCES} | options
     return jd.control.WholeBody(model, feet, center + jnp.asarray(shift), kp, kd, **options)
 
 
@@ -65,7 +66,7 @@ def evaluated(biped):
 def test_it_stands_still_at_its_target(biped, evaluated):
     """The held robot does not move, and the multipliers are the program's forces, which carry the weight."""
     model, q, _, _ = biped
-    wanted, computed, _, _, missing = evaluated(law_of(biped, preload=1.0), q, jnp.zeros(model.nv))
+    wanted, computed, _, _, missing = evaluated(law_of(biped, forces=PRELOADED), q, jnp.zeros(model.nv))
     assert bool(wanted.success) and np.asarray(wanted.margins).min() > 1.0 - 1e-6
     assert not np.asarray(wanted.tau)[np.array(BASE)].any()
     np.testing.assert_allclose(computed.acceleration, 0.0, atol=1e-8)
@@ -110,7 +111,7 @@ def assert_follows(model, law, computed):
 def test_weight_is_shifted_as_the_gains_say(biped, evaluated):
     """Centre of mass and attitude by the closed form, the held feet's forces those of the program, inside the cones."""
     model, q, feet, _ = biped
-    law = law_of(biped, (0.03, 0.0, -0.02), preload=1.0)
+    law = law_of(biped, (0.03, 0.0, -0.02), forces=PRELOADED)
     scene = jd.control.standing(model, q, feet)
     moved = jd.simulate(
         scene, q, jnp.zeros(model.nv), TS, control=law, stepsize=0.02, events=[jd.events.ContactLost(stop=False)]
@@ -187,15 +188,15 @@ def test_batches_and_gradients_in_gains(biped):
     ("call", "message"),
     [
         (lambda x: law_of(x, kp=-1.0), "kp is -1.0, which is not positive definite"),
-        (lambda x: law_of(x, turn_kd=0.0), "turn_kd is 0.0"),
-        (lambda x: law_of(x, base="tail"), "'tail'"),
+        (lambda x: law_of(x, orientation=jd.control.Attitude(jnp.eye(3), kd=0.0)), "kd is 0.0"),
+        (lambda x: law_of(x, orientation=jd.control.Attitude(jnp.eye(3), "tail")), "'tail'"),
         (lambda x: law_of(x, posture=None, stiffness=1.0), "posture is None"),
         (lambda x: law_of(x, posture=jnp.zeros(3)), r"posture has shape \(3,\)"),
         (lambda x: law_of((x[0], x[1], [], x[3])), "contacts is empty"),
-        (lambda x: law_of(x, passive=None), "no free joint"),
+        (lambda x: law_of(x, forces=None), "no free joint"),
         (lambda x: jd.control.standing(x[0], x[1], []), "contacts is empty"),
         (
-            lambda x: jd.control.WholeBody(*x[::2], jnp.zeros(2), KP, KD, passive=BASE)(x[1], jnp.zeros(7)),
+            lambda x: jd.control.WholeBody(*x[::2], jnp.zeros(2), KP, KD, forces=FORCES)(x[1], jnp.zeros(7)),
             r"target has shape \(2,\), expected \(3,\)",
         ),
     ],
@@ -203,6 +204,19 @@ def test_batches_and_gradients_in_gains(biped):
 def test_bad_input_is_refused(biped, call, message):
     with pytest.raises(ValueError, match=message):
         call(biped)
+
+
+def test_former_keywords_are_taken_with_a_warning(biped):
+    model, _, feet, center = biped
+    attitude = jnp.eye(3)
+    with pytest.warns(DeprecationWarning, match=r"GroundForces|Attitude"):
+        old = jd.control.WholeBody(
+            model, feet, center, KP, KD, orientation=attitude, base="trunk", turn_kp=2.0, passive=BASE, preload=1.0
+        )
+    turn = jd.control.Attitude(attitude, "trunk", kp=2.0)
+    new = jd.control.WholeBody(model, feet, center, KP, KD, orientation=turn, forces=PRELOADED)
+    assert jax.tree.structure(old) == jax.tree.structure(new)
+    jax.tree.map(np.testing.assert_array_equal, old, new)
 
 
 @pytest.mark.slow
@@ -213,7 +227,13 @@ def test_real_robots_shift_their_weight(file):
     q, feet = crouched(model, file), feet_of(file)
     attitude, center = jnp.eye(3), jd.center_of_mass(model, q)
     at_rest, scene = jnp.zeros(model.nv), jd.control.standing(model, q, feet)
-    options = {"orientation": attitude, "posture": q, "stiffness": 4.0, "damping": 4.0, "preload": 0.1}
+    options = {
+        "orientation": attitude,
+        "posture": q,
+        "stiffness": 4.0,
+        "damping": 4.0,
+        "forces": jd.control.GroundForces(0.1),
+    }
 
     law = jd.control.WholeBody(model, feet, center, KP, KD, **options)
     wanted = quick(lambda q: law.dynamics(q, at_rest))(q)

@@ -66,7 +66,7 @@ def test_a_base_at_rest_changes_nothing(fixed):
     assert_close(at_rest.bias_force, jd.bias_force(model, q, v), 1e-12)
     jaxtyping.config.update("jaxtyping_disable", True)  # what users meet
     try:
-        with pytest.raises(ValueError, match=r"base_twist has shape \(3,\); give \(6,\)"):
+        with pytest.raises(ValueError, match=r"base_twist has shape \(3,\), expected \(6,\)"):
             newton_euler_matrices(model, q, v, base_twist=[0, 0, 1])
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)

@@ -57,7 +57,9 @@ def values(model, q, v, a, tau, external):
         "gravity_force": dynamics.gravity_force(model, q),
         "bias_force": matrix_form.inverse_dynamics(model, q, v, None),
         "inverse_dynamics": matrix_form.inverse_dynamics(model, q, v, a, external),
-        "forward_dynamics": matrix_form.forward_dynamics(model, q, v, tau, external),
+        "forward_dynamics": matrix_form.forward_dynamics(
+            model, q, v, tau + matrix_form.generalized_force(model, q, external)
+        ),
         "kinetic_energy": jd.kinetic_energy(model, q, v),
         "potential_energy": jd.potential_energy(model, q),
         "center_of_mass": centroidal.center_of_mass(model, q),
@@ -395,24 +397,6 @@ def test_batch_equals_loop_and_eager_equals_jit():
     q, v, _, tau, _ = (x[0] for x in random_states(small, 1, 2))
     compiled = quick(matrix_form.forward_dynamics)(small, q, v, tau)
     assert_close(matrix_form.forward_dynamics(small, q, v, tau), compiled, 1e-12)
-
-
-@pytest.mark.long
-def test_the_public_functions_are_the_matrix_form():
-    # Or the recursion, for large batches: the same answer.
-    model = random_tree(35, ["revolute", "spherical"])
-    q, v, a, tau, external = (x[0] for x in random_states(model, 1, 8))
-    got = quick(
-        lambda model: {
-            "mass_matrix": dynamics.mass_matrix(model, q),
-            "bias_force": dynamics.bias_force(model, q, v),
-            "inverse_dynamics": dynamics.inverse_dynamics(model, q, v, a, external=external),
-            "forward_dynamics": dynamics.forward_dynamics(model, q, v, tau, external=external),
-        }
-    )(model)
-    want = quick(values)(model, q, v, a, tau, external)
-    for key in got:
-        assert_close(got[key], want[key], 1e-12, key)
 
 
 LEAVES = ("home", "screws", "inertias", "gravity", "armature")

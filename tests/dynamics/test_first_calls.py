@@ -1,8 +1,4 @@
-"""What shortens a first call: code that is made ahead by another thread, and quick options for XLA."""
-
-import gc
-import threading
-import time
+"""What shortens a first call: quick options for XLA, and few programs."""
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +8,9 @@ from jax import monitoring
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
-from jaxdyn.compile import executables, first_calls, objects, target
+from jaxdyn.compile import objects, stored
 
 pytestmark = pytest.mark.native
-
-LONGEST = 20.0  # s that a test waits for another thread
 
 
 def options(name):
@@ -24,9 +18,9 @@ def options(name):
 
     def in_force(monkeypatch):
         monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", name)
-        executables.quick_options.cache_clear()
+        stored.quick_options.cache_clear()
         yield
-        executables.quick_options.cache_clear()
+        stored.quick_options.cache_clear()
 
     return pytest.fixture(in_force, name=name)
 
@@ -39,78 +33,11 @@ def native(function):
     return lambda *args: backend.kernel(lambda _, *args: function(*args))((), *args)
 
 
-def is_made(before: set, count: int = 1) -> list[bool]:
-    """Whether each kernel that is new has code."""
-    new = [target._kernels[number] for number in target._kernels if number not in before]
-    assert len(new) == count
-    return [made.is_made for made in new]
+# --- code that is made when it is called ---
 
 
-def awaited(condition) -> bool:
-    end = time.monotonic() + LONGEST
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return condition()
-
-
-# --- code that is made ahead ---
-
-
-def test_code_is_made_while_the_rest_is_traced():
-    seen = []
-
-    def function(x):
-        before = set(target._kernels)
-        y = native(lambda x: jnp.sin(x) * 1.17171)(x)
-        seen.append(awaited(lambda: is_made(before) == [True]))
-        return y
-
-    x = jnp.arange(3.0)
-    np.testing.assert_allclose(backend.entry_point(function)(x), jnp.sin(x) * 1.17171, rtol=1e-15)
-    assert seen == [True]
-
-
-@pytest.mark.parametrize("batched", [False, True])
-def test_code_is_not_made_ahead_for_a_program_that_others_call(batched, monkeypatch):
-    """Under `jax.jit`, and in a batch, nobody knows yet what is called."""
-    monkeypatch.setattr(target, "make_ahead", lambda number: pytest.fail("made ahead"))
-    function = backend.entry_point(native(lambda x: jnp.sin(x) * 1.27272 + float(batched)))
-    x = jnp.arange(6.0).reshape(2, 3)
-    computed = jax.vmap(function)(x) if batched else jax.jit(function)(x[0])
-    np.testing.assert_allclose(computed, jnp.sin(x if batched else x[0]) * 1.27272 + float(batched), rtol=1e-15)
-
-
-def test_code_of_a_way_that_is_hardly_taken_is_not_made_ahead():
-    @backend.kernel(fallback=lambda _, x: jnp.sin(x) * 1.37373)
-    def fast(_, x):
-        return backend.mark_invalid(~jnp.all(x > 0), jnp.cos(x))
-
-    before, x = set(target._kernels), 1 + jnp.arange(3.0)
-    repaired = backend.entry_point(lambda x: fast((), x))
-    np.testing.assert_allclose(repaired(x), jnp.cos(x), rtol=1e-15)
-    assert sorted(is_made(before, 2)) == [False, True]
-    np.testing.assert_allclose(repaired(-x), jnp.sin(-x) * 1.37373, rtol=1e-15)
-    assert is_made(before, 2) == [True, True]
-
-
-def test_no_thread_outlives_the_call_and_the_collector_stays_on():
-    """Also where what was to be made has not been begun."""
-    before, seen, slow = set(threading.enumerate()), [], threading.Event()
-
-    def function(x):
-        for k in range(3):
-            x = native(lambda x, k=k: jnp.sin(x) * (1.48484 + k))(x)
-        first_calls.make_later(lambda: slow.wait(0.2))
-        seen.append((gc.isenabled(), len(set(threading.enumerate()) - before)))
-        return x
-
-    backend.entry_point(function)(jnp.arange(3.0))
-    assert seen == [(True, 1)]
-    assert not [x for x in set(threading.enumerate()) - before if "jaxdyn" in x.name]
-
-
-def test_an_error_of_the_other_thread_is_told_to_who_calls(monkeypatch):
-    """It is made again when it is called: first it fails there too, then not any more."""
+def test_an_error_of_llvm_is_told_to_who_calls(monkeypatch):
+    """It is compiled again at the next call."""
     fails, made = [True], objects.compile_text
 
     def failing(text, *options):
@@ -131,16 +58,8 @@ def test_an_error_of_the_other_thread_is_told_to_who_calls(monkeypatch):
 # --- the switch ---
 
 
-def test_the_environment_turns_both_off(usual, monkeypatch):
-    monkeypatch.setattr(target, "make_ahead", lambda number: pytest.fail("made ahead"))
-    seen = []
-
-    def function(x):
-        seen.append(first_calls.is_active())
-        return native(lambda x: jnp.sin(x) * 1.67676)(x)
-
-    np.testing.assert_allclose(backend.entry_point(function)(jnp.ones(2)), np.sin(1) * 1.67676, rtol=1e-15)
-    assert set(seen) == {False} and executables.quick_options() is None
+def test_the_environment_turns_the_options_off(usual):
+    assert stored.quick_options() is None
 
 
 def test_both_ways_agree(request):
@@ -171,7 +90,7 @@ def test_the_least_optimisation_gives_other_code_and_the_same_numbers(request):
     request.getfixturevalue("least")
     np.testing.assert_allclose(torque(2.0), 2 * one, rtol=1e-14)
     assert objects.name_of_file("a program") != key
-    options = executables.quick_options()
+    options = stored.quick_options()
     assert options is not None and options["xla_backend_optimization_level"] == 0
 
 
@@ -210,7 +129,7 @@ def programs():
         if event.endswith("backend_compile_duration"):
             names.append(of.get("fun_name"))
 
-    executables.quick_options()
+    stored.quick_options()
     monitoring.register_event_duration_secs_listener(seen)
     yield names
     monitoring.unregister_event_duration_listener(seen)
@@ -256,8 +175,9 @@ def test_a_quantity_of_known_numbers_is_one_program(programs, of):
 @pytest.mark.long
 def test_degrees_of_freedom_and_rates_are_one_program_each(programs):
     scene, (q, v) = jd.scenes.slider_crank(), jd.scenes.slider_crank.start()
+    other = q + 0.01
     programs.clear()
-    assert jd.degrees_of_freedom(scene, q) == 1 and jd.degrees_of_freedom(scene, q + 0.01) == 1
+    assert jd.degrees_of_freedom(scene, q) == 1 and jd.degrees_of_freedom(scene, other) == 1
     assert len(programs) <= 2, programs
     programs.clear()
     jd.stiffness(scene, q, v)

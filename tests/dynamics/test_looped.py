@@ -8,7 +8,7 @@ import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree, to_pinocchio
 
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.dynamics import scans, sizes, world_frame
+from jaxdyn.dynamics import scans, tree_frames, world_frame
 from jaxdyn.model.robots import chain as planar_chain
 from jaxdyn.model.robots import random_tree as chain
 
@@ -75,7 +75,7 @@ def test_five_hundred_links(branching):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("links", [pytest.param(40, marks=pytest.mark.slow), sizes.MAX_BODIES + 1])
+@pytest.mark.parametrize("links", [pytest.param(40, marks=pytest.mark.slow), tree_frames.MAX_BODIES + 1])
 @pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 40])
 def test_long_chains(count, links):
     """Sweeps in native code, against the matrix form."""

@@ -1,8 +1,6 @@
 """The recursions written with arrays: against the matrix form, Pinocchio and their own identities, on every joint kind."""
 
-import ast
 import functools
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -134,36 +132,33 @@ PLAIN = [name for name, rule in RULES.items() if isinstance(rule, np.ufunc)] + [
 
 def everything(model, q, v, a, tau, wrenches):
     """All quantities at one sample."""
-    again, tangent = recursions.aba_tangent(model, q, v, tau, lambda acc: tau - 0.5 * acc)
+    again, times_inverse = recursions.acceleration_and_inverse(model, q, v, tau)
     return {
         "rnea": recursions.rnea(model, q, v, a),
-        "rnea external": recursions.rnea(model, q, v, a, external=wrenches),
         "bias": recursions.bias_force(model, q, v),
         "gravity": recursions.gravity_force(model, q),
         "aba": recursions.aba(model, q, v, tau),
         "crba": recursions.crba(model, q),
         "sqrt": recursions.mass_matrix_sqrt(model, q),
         "again": again,
-        "tangent": tangent,
+        "tangent": times_inverse(tau - 0.5 * again),
     }
 
 
 def expected(model, q, v, a, tau, wrenches):
-    """The same from the matrix form's M, C v + N, N and forces of external wrenches."""
+    """The same from the matrix form's M, C v + N, and N."""
 
-    def at(q, v, wrenches):
+    def at(q, v):
         return (
             matrix_form.mass_matrix(model, q),
             matrix_form.inverse_dynamics(model, q, v, None),
             matrix_form.gravity_force(model, q),
-            matrix_form.generalized_force(model, q, wrenches),
         )
 
-    mass, bias, weight, pushed = (np.asarray(x) for x in quick(at)(q, v, wrenches))
+    mass, bias, weight = (np.asarray(x) for x in quick(at)(q, v))
     free = np.linalg.solve(mass, tau - bias)
     return {
         "rnea": mass @ a + bias,
-        "rnea external": mass @ a + bias - pushed,
         "bias": bias,
         "gravity": weight,
         "aba": free,
@@ -194,24 +189,6 @@ def test_against_matrix_form(name, traced):
     root = np.asarray(got["sqrt"])
     assert_close(root @ root.T, want["crba"], 1e-10, "W W^T")
     assert_close(np.prod(np.diag(root)) ** 2, np.linalg.det(want["crba"]), 1e-9, "det M = prod W_kk^2")
-
-
-def test_against_pinocchio():
-    model = TREES["every kind"]()
-    source, bridge = to_pinocchio(model)
-    data = source.createData()
-    q, v, a, tau, _ = random_states(model, 3, 8)
-
-    def at(q, v, a, tau):
-        return recursions.rnea(model, q, v, a), recursions.aba(model, q, v, tau), recursions.crba(model, q)
-
-    force, acceleration, mass = run(jax.vmap(at), q, v, a, tau)
-    for i, q_pin in enumerate(bridge.q_to_pinocchio(q)):
-        vi, ai, ti = (np.asarray(x[i]) for x in (v, a, tau))
-        M = pin.crba(source, data, q_pin)
-        assert_close(force[i], pin.rnea(source, data, q_pin, vi, ai), 1e-11, "rnea")
-        assert_close(acceleration[i], pin.aba(source, data, q_pin, vi, ti), 1e-10, "aba")
-        assert_close(mass[i], np.triu(M) + np.triu(M, 1).T, 1e-11, "crba")
 
 
 @pytest.mark.long
@@ -335,21 +312,3 @@ def test_congruence_by_twice_the_angle():
             R = turn.matrix(size)
             assert_close(R @ R.T, np.eye(size), 1e-15)
             assert_close(turn.congruence(A), R @ A @ R.T, 1e-14)
-
-
-def test_imports():
-    """The package knows the model and the Lie groups, not what it is checked against."""
-    allowed = (
-        "jaxdyn.dynamics.recursions",
-        "jaxdyn.compile",
-        "jaxdyn.model.arguments",
-        "jaxdyn.model.joints",
-        "jaxdyn.model.tree",
-        "jaxdyn.lie.so3",
-        "jaxdyn.lie.se3",
-        "jaxdyn.lie.se2",
-    )
-    for file in (Path(jaxdyn.__file__).parent / "dynamics" / "recursions").glob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("jaxdyn"):
-                assert node.module.startswith(allowed), (file.name, node.module)

@@ -10,7 +10,7 @@ import pytest
 from pinocchio_bridge import quick
 
 from jaxdyn import RESULTS, ModelBuilder, assemble, scenes, simulate
-from jaxdyn.constraints.tolerances import coordinate_sizes, own_length
+from jaxdyn.constraints.redundancy import coordinate_sizes, own_length
 
 LENGTHS = np.array([1.0, 3.0, 2.5, 3.5])
 SCALES = (1e-9, 1e-6, 1e-3, 1.0, 1e5, 1e6)

@@ -11,7 +11,7 @@ from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
-from jaxdyn.compile import shared
+from jaxdyn.compile import primitive
 
 pytestmark = pytest.mark.native
 
@@ -33,7 +33,7 @@ def called(function, *args) -> list[str]:
 
 @pytest.mark.parametrize("least", [1, 10**6], ids=["divided", "whole"])
 def test_numbers_that_do_not_vary(monkeypatch, least):
-    monkeypatch.setattr(shared, "MIN_SHARED_OPERATIONS", least)
+    monkeypatch.setattr(primitive, "MIN_SHARED_OPERATIONS", least)
 
     def compute(a, b):
         return backend.kernel(numbers, static=1)(least, a, b)

@@ -9,7 +9,7 @@ from pinocchio_bridge import assert_close, quick
 import jaxdyn as jd
 from jaxdyn.compile import kernel
 from jaxdyn.compile.trace import program_of
-from jaxdyn.dynamics import centroidal, kinematics, recursions, scans, sizes, tree_frames, world_frame
+from jaxdyn.dynamics import centroidal, kinematics, recursions, scans, tree_frames, world_frame
 from jaxdyn.dynamics.recursions import sweeps
 from jaxdyn.model.robots import random_tree
 
@@ -80,8 +80,14 @@ def test_floating_base(kinds, given, armature):
 
     def of(form):
         def all_of(model, q, v, x):
-            a, times = form.aba_tangent(model, q, v, x, lambda a: x * a)
-            return a, times, form.rnea(model, q, v, x), form.bias_force(model, q, v), form.gravity_force(model, q)
+            a, times = form.acceleration_and_inverse(model, q, v, x)
+            return (
+                a,
+                times(x * a),
+                form.rnea(model, q, v, x),
+                form.bias_force(model, q, v),
+                form.gravity_force(model, q),
+            )
 
         compiled = kernel(all_of)
         return quick(compiled)(model, q, v, x) if given else quick(lambda *s: compiled(model, *s))(q, v, x)
@@ -115,9 +121,9 @@ def test_batches_gravity_and_given_inertias():
 @pytest.mark.parametrize("kinds", [("revolute",), ("free",), pytest.param(("helical",), marks=pytest.mark.slow)])
 def test_derivatives(kinds, monkeypatch):
     """Reverse mode of public functions over all leaves: against the recursions that are written out, and differences."""
-    nb = sizes.MIN_BODIES_IN_SWEEPS
+    nb = tree_frames.MIN_BODIES_IN_SWEEPS
     is_floating = kinds == ("free",)
-    monkeypatch.setattr(sizes, "MAX_BODIES", nb - 1 if is_floating else sizes.MAX_BODIES)
+    monkeypatch.setattr(tree_frames, "MAX_BODIES", nb - 1 if is_floating else tree_frames.MAX_BODIES)
     model = floating(("revolute",), nb, 1.3) if is_floating else tree(kinds, nb=nb, branching=1.3)
     at = (model, *state(model))
     weights = jnp.cos(jnp.arange(model.nv))
@@ -175,7 +181,7 @@ MIXED = ("revolute", "spherical", "prismatic", "planar", "free", "helical")
 @pytest.mark.parametrize("given", [False, True])
 def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
     """Dynamics in link frames and kinematics as native loops, against products of matrices by JAX."""
-    monkeypatch.setattr(sizes, "MIN_BODIES_IN_LOOPS", 4)
+    monkeypatch.setattr(tree_frames, "MIN_BODIES_IN_LOOPS", 4)
     model = random_tree(3, 12, branching=1.6, skew=1.0, taper=0.9, kinds=kinds)
     model = model.replace(armature=jnp.linspace(0.1, 0.2, model.nv))
     _, v, x = state(model)
@@ -185,8 +191,8 @@ def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
         def values(model, q, v, x):
             frame = tree_frames.tree_frame(model, q)
             kinetic = centroidal._kinetic_energy(model, q, v), world_frame.generalized_force(model, q, wrenches)
-            pair = form.forward_dynamics_tangent(model, q, v, x, lambda a: x * a)
-            return frame, *kinetic, *pair, form.inverse_dynamics(model, q, v, x)
+            a, times = form.acceleration_and_inverse(model, q, v, x)
+            return frame, *kinetic, a, times(x * a), form.inverse_dynamics(model, q, v, x)
 
         return values
 
@@ -203,7 +209,7 @@ def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
 )
 def test_many_joints_of_several_kinds(kinds):
     """Public functions of a tree with more bodies than are written out, and their derivatives against differences."""
-    model = random_tree(3, sizes.MAX_BODIES + 4, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
+    model = random_tree(3, tree_frames.MAX_BODIES + 4, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
     _, v, x = state(model)
     q = jd.random_configuration(model, jax.random.key(0))
     M, a = quick(lambda q: (jd.mass_matrix(model, q), jd.forward_dynamics(model, q, v, x)))(q)
@@ -236,14 +242,14 @@ def test_code_of_kinematics_does_not_grow_with_the_bodies():
         of_all = program_of(kinematics._world_poses.__wrapped__, (), model, (q,))[1][0]
         return [len(x.body.operations) for x in of_all.subprograms]
 
-    few = sizes.MIN_BODIES_IN_LOOPS
+    few = tree_frames.MIN_BODIES_IN_LOOPS
     assert sum(count(few)) == sum(count(2 * few))
 
 
 @pytest.mark.parametrize("kinds", [("revolute",), pytest.param(("revolute", "spherical"), marks=pytest.mark.slow)])
 def test_recursions_by_name_of_many_bodies(kinds):
     """`rnea`, `aba` and `crba` of many bodies are the loops of the public quantities, with wrenches and without accelerations."""
-    model = random_tree(3, sizes.MAX_BODIES + 2, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
+    model = random_tree(3, tree_frames.MAX_BODIES + 2, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
     _, v, x = state(model)
     q, wrenches = jd.random_configuration(model, jax.random.key(0)), jnp.ones((model.nb, 6))
     computed = quick(

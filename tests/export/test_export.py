@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.compile import object_files, standalone
+from jaxdyn.compile import standalone
 from jaxdyn.compile.objects import code_of
 
 X = np.linspace(0.1, 0.7, 7)
@@ -129,7 +129,7 @@ def test_header_names_joints_units_sizes_and_stack(exported, tmp_path):
 
 
 def test_batch_over_vector_lanes_equals_single_samples(exported):
-    lanes = object_files.resolve_target("host").lanes
+    lanes = standalone.resolve_target("host").lanes
     code = code_of(exported.module("c", lanes))
     for n in (0, 1, 3, 13):
         rng = np.random.default_rng(n)
@@ -223,7 +223,7 @@ def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
     np.testing.assert_allclose(exported.jacobian(q * 0, q * 0, q)[2], np.linalg.inv(M), rtol=1e-10)
 
     rows = np.stack([q, q * 0, q, -q, q * 0]), np.zeros((5, 2)), np.tile(q, (5, 1))
-    lanes = object_files.resolve_target("host").lanes
+    lanes = standalone.resolve_target("host").lanes
     code = code_of(exported.module("c", lanes))
     batch = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, *[ctypes.c_void_p] * 4)(code.address("crossing_batch"))
     out = np.full((5, 2), np.nan)
@@ -247,7 +247,7 @@ def test_rows_that_contradict_each_other_give_a_status(tmp_path):
 def test_results_that_are_not_finite_have_a_status(tmp_path):
     exported = jd.export(lambda x: (jnp.log(x), 1 / x), np.zeros(2), name="f", batch=True)
     assert np.isinf(exported(np.zeros(2))[0]).all()
-    lanes = object_files.resolve_target("host").lanes
+    lanes = standalone.resolve_target("host").lanes
     code = code_of(exported.module("c", lanes))
     one, many = (
         ctypes.CFUNCTYPE(ctypes.c_int, *kinds)(code.address(name))
@@ -512,7 +512,7 @@ def test_every_target_compiles(exported, tmp_path, target):
 
 
 def test_baseline_of_x86_64_runs_here(exported, tmp_path):
-    if not object_files.resolve_target("host").triple.startswith("x86_64"):
+    if not standalone.resolve_target("host").triple.startswith("x86_64"):
         pytest.skip("another processor")
     exported.save(tmp_path, target="x86_64")
     run_c(tmp_path, "arm_fd")
@@ -558,7 +558,7 @@ def test_maxima_on_cortex_m(tmp_path):
     exported = jd.export(lambda x: (jnp.maximum(x[0], x[1]), jnp.min(x), jnp.clip(x, 0.2, 0.5)), X, name="largest")
     exported.save(tmp_path, target="cortex-m7")
     assert all(name.startswith("__aeabi") for name in undefined_symbols(tmp_path / "largest.o"))
-    text = object_files._without_maximum(exported.module())
+    text = standalone._without_maximum(exported.module())
     assert "@llvm.maximum" not in text and "@llvm.minimum" not in text
     code = code_of(text)
     function = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4)(code.address("largest"))

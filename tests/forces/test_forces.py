@@ -78,7 +78,7 @@ def test_motions_against_closed_forms(sliders):
     q0 = np.concatenate([start, [np.cos(0.5)], np.sin(0.5) * axis])
     v0 = np.concatenate([speed, 0.3 * axis])
     # Dense output is an order of magnitude less accurate than the steps, hence the tight tolerances.
-    solution = jd.simulate(scene, q0, v0, ts, rtol=1e-14, atol=1e-14)
+    solution = jd.simulate(scene, q0, v0, ts, stepsize=jd.Steps(rtol=1e-14, atol=1e-14))
     names = list(sliders.joint_names)
     assert names == [*MASS, "turn"]
     expected = {}

@@ -59,14 +59,16 @@ def test_gradient_through_a_stop_is_that_of_the_closed_form(damping):
     """Ten times the tolerance, of derivatives up to 6; with damping the force jumps where the stop is met."""
     exact = jax.jacfwd(lambda x: thrown_back(x, damping))(X)
     for tolerance in (1e-6, 1e-8):
-        options = {"rtol": tolerance, "atol": tolerance}
+        options = {"stepsize": jd.Steps(rtol=tolerance, atol=tolerance)}
         np.testing.assert_allclose(end(mass(damping), X, **options), thrown_back(X, damping), atol=10 * tolerance)
         slopes = jax.jacrev(lambda x: end(mass(damping), x, **options))(X)  # noqa: B023
         np.testing.assert_allclose(slopes, exact, atol=10 * tolerance * np.abs(exact).max())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"stepsize": 1e-3}, {"adjoint": "forward"}, {"method": "free", "rtol": 1e-9}])
+@pytest.mark.parametrize(
+    "options", [{"stepsize": 1e-3}, {"adjoint": "forward"}, {"method": "free", "stepsize": jd.Steps(rtol=1e-9)}]
+)
 def test_gradient_through_a_stop_by_other_steps(options):
     """RK4 with 1 ms follows the spring's 32 rad/s to (0.03)^4."""
     exact = jax.jacfwd(lambda x: thrown_back(x, 20.0))(X)
@@ -166,7 +168,7 @@ def test_gradient_of_a_spring_with_play():
 @pytest.mark.long
 def test_derivatives_across_kinks_are_refused_where_steps_cannot_end_there():
     """Implicit steps are not cut; their motion is right, their derivative would lack what the time of the stop adds."""
-    options = {"solver": diffrax.Kvaerno5(), "rtol": 1e-6, "atol": 1e-6}
+    options = {"solver": diffrax.Kvaerno5(), "stepsize": jd.Steps(rtol=1e-6, atol=1e-6)}
     np.testing.assert_allclose(end(mass(20.0), X, **options), thrown_back(X, 20.0), atol=1e-4)
     with pytest.raises(ValueError, match=r"PiecewiseForce.*Kvaerno5.*Dopri8"):
         jax.jacrev(lambda x: end(mass(20.0), x, **options))(X)

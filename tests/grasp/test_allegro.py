@@ -26,7 +26,7 @@ def hand():
 def test_the_hand_is_that_of_its_file(robots_dir):
     """Every number of the built-in hand is the URDF's, but for inertias that no body has; it has no friction."""
     path = robots_dir / "allegro_hand_description" / "urdf" / "allegro_right_hand.urdf"
-    read, hand = jd.load_urdf(path), jd.robots.allegro()
+    read, hand = jd.load_model(path), jd.robots.allegro()
     for name in ("parents", "kinds", "joint_names", "body_names", "frame_names", "frame_bodies", "couplings"):
         assert getattr(read.topology, name) == getattr(hand.topology, name), name
     bodies = [int(name.partition("_")[2].partition(".")[0]) for name in hand.body_names]

@@ -66,7 +66,7 @@ def test_delays_are_found_to_their_intervals():
 @pytest.mark.long
 def test_shifts_that_do_not_settle_are_refused(monkeypatch):
     """One round of the first-order model does not reach the delay."""
-    monkeypatch.setattr("jaxdyn.identify.delays._ROUNDS", 1)
+    monkeypatch.setattr("jaxdyn.identify.robot._ROUNDS", 1)
     with pytest.raises(ValueError, match="delays do not converge; the last ones are"):
         identify.fit_robot(arm(), [late(1, (0.02, 0.02))], delay="auto", **GIVEN)
 

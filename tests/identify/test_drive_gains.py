@@ -139,7 +139,7 @@ def test_weights_that_have_not_settled_are_said(monkeypatch):
     assert bool(found.success)
     for name, least in (("MOST_ROUNDS", 1), ("_STEPS", 1)):
         with monkeypatch.context() as patch:
-            patch.setattr(f"jaxdyn.identify.workflows.drive_gains.{name}", least)
+            patch.setattr(f"jaxdyn.identify.drive_gains.{name}", least)
             short = identify.fit_gains(model, unloaded, loaded, MASS, CENTRE, v_s=0.05)
         assert short.result is RESULTS.max_steps_reached
         assert "NOT CONVERGED: max steps reached" in gains_text(short, model.joint_names)

@@ -11,9 +11,9 @@ import jaxdyn as jd
 from jaxdyn.cli import main
 from jaxdyn.constraints.base import position_residual
 from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.identify.applied_fits import fit_mechanism
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.replay import Segments, simulate_segment
-from jaxdyn.identify.workflows.mechanism_fit import fit_mechanism
 
 T = np.linspace(0.0, 1.0, 41)
 

@@ -11,16 +11,14 @@ from benchmarks.identify_selection import motion as random_motion
 from jaxdyn import identify, inertia
 from jaxdyn.cli.identify_tables import payload_text
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.identify.condensed import block_slices, condense_rows
 from jaxdyn.identify.condensed_fit import Setting, eliminate, fit_blocks, share_of_extra
 from jaxdyn.identify.logs import filter_like_log, idle_coordinates, samples_for_jumps, travel_ranges
-from jaxdyn.identify.regression import condense, condense_model
-from jaxdyn.identify.robot_problem import RobotProblem, huber_weights
+from jaxdyn.identify.raw_logs import check_log_content, check_rest, motion_band, vibration
+from jaxdyn.identify.regression import block_slices, condense, condense_model, condense_rows
+from jaxdyn.identify.robot_logs import RobotLogs, huber_weights
 from jaxdyn.identify.selection import improving_torques, is_clear, log_errors, splits, standard_error
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, is_white, jackknife, model_error_factors
-from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
-from jaxdyn.identify.workflows.raw_logs import motion_band, vibration
 from jaxdyn.model.builder import ModelBuilder
 
 
@@ -205,11 +203,11 @@ def test_loads_that_have_not_settled_are_said(truth, monkeypatch):
     loaded[10:20] += np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
     held = measured(arm(), motion(3), loaded, noise=0.02, seed=3)
     assert bool(identify.fit_payload(model, log(1), held, robot=fit).success)
-    monkeypatch.setattr("jaxdyn.identify.workflows.payload.MOST_ROUNDS", 1)
+    monkeypatch.setattr("jaxdyn.identify.applied_fits.MOST_ROUNDS", 1)
     short = identify.fit_payload(model, log(1), held, robot=fit)
     assert short.result is RESULTS.max_steps_reached and "NOT CONVERGED" in payload_text(short)
     basic, extra, where = split_terms(terms, 2)
-    problem = RobotProblem(model, (log(1),), basic, extra, "full", 20)
+    problem = RobotLogs(model, (log(1),), basic, extra, "full", 20)
     for rounds, code in ((3, RESULTS.max_steps_reached), (30, RESULTS.successful)):
         assert problem.refine(Setting(0.01, where, 1.0), None, rounds).result is code
 
@@ -305,12 +303,12 @@ def test_clear_improvements():
 def test_weights_of_samples_come_from_the_fitted_half_alone(truth):
     """A robust loss that is of no use has no gain: weights from all samples gave one of tens of per cent."""
     model, noise = arm(), 0.1 * np.random.default_rng(0).standard_t(2.5, size=(600, 2))
-    problem = RobotProblem(model, (measured(model, motion(1, 600, 12.0), truth, noise),), identify.TERMS, (), "full", 8)
+    problem = RobotLogs(model, (measured(model, motion(1, 600, 12.0), truth, noise),), identify.TERMS, (), "full", 8)
     plain = Setting(0.01, (), 1.0)
     before, after = problem.loss_squares(plain, [plain, plain._replace(robust=1.345)])
     # The same as fits of half of the samples by hand.
     rest, part = np.arange(4), np.arange(4, 8)
-    own = RobotProblem(model, (problem.logs[0][:300],), identify.TERMS, (), "full", 4)
+    own = RobotLogs(model, (problem.logs[0][:300],), identify.TERMS, (), "full", 4)
     own.chart = problem.chart
     estimate = fit_blocks(problem.chart, own.data(plain), plain, problem.sizes, own.weights)
     wanted = problem.data(plain).blocks.squares(estimate.x, part)

@@ -10,7 +10,7 @@ import jaxdyn as jd
 from jaxdyn import identify
 from jaxdyn.cli import main
 from jaxdyn.identify import LogWarning
-from jaxdyn.identify.workflows.log_repair import find_outliers, repair_log, unwrap_angles
+from jaxdyn.identify.log_repair import find_outliers, repair_log, unwrap_angles
 from jaxdyn.io.logs import read_log, write_log
 from jaxdyn.model.builder import ModelBuilder
 
@@ -284,7 +284,7 @@ def test_command_line(clean, tmp_path, capsys):
     assert main([*args[:-1], "none", "--out", str(tmp_path / "clean.urdf")]) == 0
     assert "unwrapped" not in (text := capsys.readouterr().out) and "corrupted" not in text
     base = identify.base_parameters(make_arm(), identify.TERMS)
-    models = make_arm(), jd.load_urdf(tmp_path / "clean.urdf"), jd.load_urdf(out)
+    models = make_arm(), jd.load_model(tmp_path / "clean.urdf"), jd.load_model(out)
     true, reference, fitted = (np.asarray(base.values(identify.nominal_parameters(model))) for model in models)
     np.testing.assert_allclose(fitted, reference, atol=1e-4)
     # The low-pass flattens what is quadratic in the motion; that is 1 % of the largest number at this cut-off.

@@ -7,7 +7,7 @@ import pytest
 
 from jaxdyn import identify
 from jaxdyn.identify.logs import check_log
-from jaxdyn.identify.workflows.raw_logs import spline_lines
+from jaxdyn.identify.raw_logs import spline_lines
 from jaxdyn.io.logs import read_log, write_log
 from jaxdyn.model.builder import ModelBuilder
 

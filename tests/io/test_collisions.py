@@ -180,7 +180,7 @@ def test_sdf_shapes_touch_a_plane(tmp_path):
     assert "<collision> of links" not in lines
     assert "<collision> of links: floor::slab, m::b" in "; ".join(load(path).not_taken)
     with pytest.warns(jd.io.NotTakenWarning, match="cone"):
-        assert len(touching_of(jd.io.load_sdf(path, contacts=["m::b"]))) == 20
+        assert len(touching_of(jd.load(path, contacts=["m::b"]))) == 20
 
 
 MJCF = """<mujoco><asset><mesh name="t" vertex="0 0 0  0.1 0 0  0 0.2 0  0 0 0.3"/>
@@ -232,7 +232,7 @@ def test_mjcf_geoms_touch_a_plane(tmp_path):
     rules = '<contact><pair geom1="floor" geom2="ball" friction="0.3 0.3 0 0 0"/><exclude body1="world" body2="d"/></contact>'
     path.write_text(MJCF.format(ground=FLOOR, more=rules))
     with pytest.warns(jd.io.NotTakenWarning, match=r"collision shapes without contacts: world \(fixed\)"):
-        touching = touching_of(jd.io.load_mjcf(path, contacts=["c", "d"]))
+        touching = touching_of(jd.load(path, contacts=["c", "d"]))
     assert set(touching) == {"c"} and float(touching["c"].coefficient) == 0.3
 
 

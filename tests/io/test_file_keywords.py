@@ -23,13 +23,17 @@ def test_dtypes_bases_and_gravity(tmp_path):
         (tmp_path / name).write_text(text)
     readers = (
         lambda dtype: jd.io.load(tmp_path / "r.urdf", dtype=dtype).system,
-        lambda dtype: jd.io.load_mjcf(tmp_path / "b.xml", dtype=dtype).system,
-        lambda dtype: jd.io.load_sdf(tmp_path / "m.sdf", dtype=dtype).system,
+        lambda dtype: jd.load(tmp_path / "b.xml", dtype=dtype).system,
+        lambda dtype: jd.load(tmp_path / "m.sdf", dtype=dtype).system,
     )
     for read in readers:
         assert read(jnp.float32).home.dtype == np.float32 and read(jnp.float64).home.dtype == np.float64
-    assert jd.io.load_sdf(tmp_path / "m.sdf").system.nv == 7
-    assert jd.io.load_sdf(tmp_path / "m.sdf", floating_base=False).system.nv == 1
+    with pytest.warns(DeprecationWarning, match=r"jd\.io\.load_sdf is deprecated; call load"):
+        assert jd.io.load_sdf(tmp_path / "m.sdf").system.nv == 7
+    with pytest.warns(DeprecationWarning, match=r"load_urdf is deprecated; call load_model"):
+        assert jd.load_urdf(tmp_path / "r.urdf").nv == 1
+    assert jd.load_model(tmp_path / "m.sdf", floating_base=False).nv == jd.load_model(tmp_path / "b.xml").nv == 1
+    assert jd.load(tmp_path / "m.sdf", floating_base=False).system.nv == 1
     for g in (1.62, 9.81):
         model = jd.io.load(tmp_path / "r.urdf", gravity=(0.0, 0.0, -g)).system
         torque = jd.gravity_force(model, jnp.array([0.3]))
@@ -37,11 +41,11 @@ def test_dtypes_bases_and_gravity(tmp_path):
 
 
 def test_every_reader_names_what_it_does_not_read(tmp_path):
-    """`load_urdf` and `load` in the same words, of a misspelt element and of an attribute; both are silent without any."""
+    """`load_model` and `load` in the same words, of a misspelt element and of an attribute; both are silent without any."""
     path = tmp_path / "r.urdf"
     path.write_text(URDF.format('<dynamics dampng="3"/><limt effort="1"/>'))
     words = []
-    for read in (jd.load, jd.load_urdf, jd.io.load):
+    for read in (jd.load, jd.load_model, jd.io.load):
         with pytest.warns(jd.io.NotTakenWarning) as caught:
             read(path)
         words.append([str(one.message) for one in caught])
@@ -50,7 +54,7 @@ def test_every_reader_names_what_it_does_not_read(tmp_path):
     path.write_text(URDF.format(""))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for read in (jd.load, jd.load_urdf):
+        for read in (jd.load, jd.load_model):
             read(path)
 
 

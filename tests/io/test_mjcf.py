@@ -20,7 +20,7 @@ def silent(path) -> jd.io.LoadedScene:
     """The scene of a file, whatever is not taken."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the compiler's own too, of attributes that are to go
-        return jd.io.load_mjcf(path)
+        return jd.load(path)
 
 
 MIXED = """
@@ -142,7 +142,7 @@ def test_keyframes_are_starts_in_our_coordinates(mixed):
 def test_what_is_not_taken_is_named_by_a_warning(mixed):
     path, scene = mixed
     with pytest.warns(jd.io.NotTakenWarning) as caught:
-        jd.io.load_mjcf(path)
+        jd.load(path)
     assert len(caught) == 1
     text = str(caught[0].message)
     for part in (
@@ -163,7 +163,7 @@ def test_friction_is_smoothed_and_springs_are_forces(mixed):
 
 def test_a_file_without_anything_else_warns_of_nothing(tmp_path):
     body = BODY.replace("<geom ", '<geom contype="0" conaffinity="0" ')
-    scene = jd.io.load_mjcf(of_body(tmp_path, body, '<option><flag gravity="disable"/></option>'))
+    scene = jd.load(of_body(tmp_path, body, '<option><flag gravity="disable"/></option>'))
     assert scene.system.gravity is None
     assert scene.constraints == scene.forces == scene.not_taken == ()
     assert scene.actuators is None
@@ -218,7 +218,6 @@ def test_missing_meshes_and_textures_are_left_out(tmp_path):
     [
         ("<mujoco><worldbody><body></worldbody></mujoco>", ("robot.xml:1", "malformed XML")),
         ('<mujoco>\n<worldbody><body foo="3"/></worldbody></mujoco>', ("robot.xml:2", "foo")),
-        ("<robot/>", ("robot.xml:1", "<robot>", "load_urdf")),
         ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", ("robot.xml:1", "mass")),
         (
             f"<mujoco><worldbody>{TWINS}</worldbody></mujoco>",
@@ -230,19 +229,19 @@ def test_missing_meshes_and_textures_are_left_out(tmp_path):
 def test_bad_files_are_refused_with_file_and_line(tmp_path, text, parts):
     with pytest.raises(ValueError) as caught, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # mujoco's own, of the singular matrix
-        jd.io.load_mjcf(write(tmp_path, text))
+        jd.load(write(tmp_path, text))
     assert all(part in str(caught.value) for part in parts), str(caught.value)
 
 
 def test_a_file_that_is_not_there_is_named():
     with pytest.raises(ValueError, match=r"nowhere\.xml.*check the path"):
-        jd.io.load_mjcf("nowhere.xml")
+        jd.load("nowhere.xml")
 
 
 def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match=r"pip install jaxdyn\[mjcf\]"):
-        jd.io.load_mjcf(of_body(tmp_path))
+        jd.load(of_body(tmp_path))
 
 
 def test_controls_of_another_number_are_refused(mixed):
@@ -273,7 +272,7 @@ def test_motions_under_activations_are_those_of_mujoco(dynamics, integrator, tmp
     body = BODY.replace("</body>", CHILD).replace("<geom ", '<geom contype="0" conaffinity="0" ')
     option = f'<option timestep="5e-4" integrator="{integrator}"/>'
     path = of_body(tmp_path, body, f"{option}<actuator>{DYNAMICS.format(dynamics)}</actuator>")
-    scene = jd.io.load_mjcf(path)
+    scene = jd.load(path)
     control, initial = np.array([1.5, 0.4, 0.8, -0.3]), np.array([0.2, -0.1, 0.0])
     m = mujoco.MjModel.from_xml_path(str(path))
     data, theirs = mujoco.MjData(m), []
@@ -369,7 +368,7 @@ def test_plain_motors_behind_a_drive(tmp_path):
     path.write_text("""<mujoco><worldbody><body><joint name="j" axis="0 1 0"/>
       <geom size=".05" pos="0 0 -.5" contype="0" conaffinity="0"/></body></worldbody>
       <actuator><motor joint="j" gear="2"/></actuator></mujoco>""")
-    robot = jd.io.load_mjcf(path)
+    robot = jd.load(path)
     drive = robot.actuators.drive(lambda q, v, t: jnp.array([0.7]))
     scene, ts = jd.Scene(robot.system, forces=[*robot.forces, drive]), jnp.array([0.0, 1.0])
     want = jd.simulate(robot.system, [0.0], [0.0], ts, control=lambda q, v, t: jnp.array([1.4])).q

@@ -29,7 +29,7 @@ def silent(path, **options) -> jd.io.LoadedScene:
     """The scene of a file, whatever is not taken."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", jd.io.NotTakenWarning)
-        return jd.io.load_sdf(path, **options)
+        return jd.load(path, **options)
 
 
 def joint(name, parent, child, kind="revolute", pose="", axis="<xyz>0 0 1</xyz>", rest="") -> str:
@@ -275,7 +275,7 @@ def test_joints_with_springs_and_damping_stay_in_the_tree(tmp_path):
     sprung = first.replace("</axis>", "<dynamics><friction>1</friction><damping>1</damping></dynamics></axis>")
     cut = "<physics><simbody><must_be_loop_joint>1</must_be_loop_joint></simbody></physics></joint>"
     with pytest.warns(jd.io.NotTakenWarning, match="joints that close loops: d"):
-        scene = jd.io.load_sdf(write(tmp_path, f"<model name='m'>{sprung.replace('</joint>', cut)}{FOUR_BAR}</model>"))
+        scene = jd.load(write(tmp_path, f"<model name='m'>{sprung.replace('</joint>', cut)}{FOUR_BAR}</model>"))
     assert [c.name for c in scene.constraints] == ["d"]
 
 
@@ -302,7 +302,7 @@ def test_followers_of_fixed_joints_are_held_at_their_offset(tmp_path):
         + joint("b", "x", "y", axis=mimic)
     )
     (tmp_path / "a.sdf").write_text(f"<sdf version='1.11'><model name='m'>{text}</model></sdf>")
-    scene = jd.io.load_sdf(tmp_path / "a.sdf")
+    scene = jd.load(tmp_path / "a.sdf")
     assert isinstance(scene.constraints[0], JointLock) and scene.not_taken == ()
     np.testing.assert_allclose(scene.constraints[0].value, [0.5 - 2 * 0.1], rtol=1e-15)
 
@@ -339,7 +339,7 @@ def test_what_is_not_taken_is_named(tmp_path):
     text = link("a", rest="<gravity>false</gravity><collision name='c'/><sensor name='s' type='imu'/>")
     text += joint("j", "world", "a") + "<plugin name='p' filename='x'/><include><uri>model://cup</uri></include>"
     with pytest.warns(jd.io.NotTakenWarning) as caught:
-        scene = jd.io.load_sdf(write(tmp_path, f"<model name='m'>{text}</model>"))
+        scene = jd.load(write(tmp_path, f"<model name='m'>{text}</model>"))
     message = str(caught[0].message)
     for part in (
         "<collision> of links: a",
@@ -350,21 +350,6 @@ def test_what_is_not_taken_is_named(tmp_path):
     ):
         assert part in message
         assert any(part in line for line in scene.not_taken)
-
-
-def test_units_that_look_wrong_are_said_aloud(tmp_path):
-    degrees = joint("j", "world", "a", axis="<xyz>0 0 1</xyz><limit><lower>-90</lower><upper>90</upper></limit>")
-    heavy = INERTIAL.replace("<izz>0.5", "<izz>500000")
-    text = link("a") + degrees + link("b", "0 0 350 0 0 0", heavy) + joint("k", "a", "b")
-    with pytest.warns(jd.io.UnitsWarning) as caught:
-        jd.io.load_sdf(write(tmp_path, f"<model name='m'>{text}</model>"))
-    for part in (
-        "robot.sdf",
-        "-90 to 90 rad of joint 'j' (degrees?)",
-        "body 'b' 350 m",
-        "radius of gyration 487.585 m",
-    ):
-        assert any(part in str(x.message) for x in caught if x.category is jd.io.UnitsWarning)
 
 
 def model_of(text: str) -> str:
@@ -421,7 +406,7 @@ BAD = {
 def test_bad_files_are_refused_with_file_and_line(tmp_path, fault):
     text, message = BAD[fault]
     with pytest.raises(ValueError) as caught:
-        jd.io.load_sdf(write(tmp_path, text))
+        jd.load(write(tmp_path, text))
     assert "robot.sdf" in str(caught.value)
     assert message in str(caught.value), str(caught.value)
 
@@ -446,14 +431,14 @@ def test_files_of_other_kinds_are_refused(tmp_path, text, message):
     path = tmp_path / "robot.sdf"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError) as caught:
-        jd.io.load_sdf(path)
+        jd.load(path)
     assert f"{path}:" in str(caught.value)
     assert message in str(caught.value)
 
 
 def test_a_file_that_is_not_there_is_named():
     with pytest.raises(ValueError, match=r"nowhere\.sdf.*check the path"):
-        jd.io.load_sdf("nowhere.sdf")
+        jd.load("nowhere.sdf")
 
 
 class Exponentials:

@@ -1,6 +1,5 @@
 """Each element and attribute of a file is read, refused, in `not_taken`, or has no effect on the motion."""
 
-import pathlib
 import re
 import warnings
 
@@ -12,84 +11,6 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.io import unread
 from jaxdyn.io.unread import Left, Part
-
-SOURCES = pathlib.Path(jd.__file__).parent / "io"
-
-# The elements of the formats' own descriptions (sdformat.org, versions 1.4 to 1.12; wiki.ros.org/urdf/XML).
-FORMATS = {
-    "SDF_LINK": "pose inertial gravity enable_wind self_collide kinematic must_be_base_link velocity_decay collision "
-    "visual sensor projector audio_sink audio_source battery light particle_emitter",
-    "SDF_LINK inertial": "pose mass inertia density auto_inertia_params fluid_added_mass",
-    "SDF_LINK inertial inertia": "ixx ixy ixz iyy iyz izz",
-    "SDF_LINK velocity_decay": "linear angular",
-    "SDF_JOINT": "parent child gearbox_ratio gearbox_reference_body thread_pitch screw_thread_pitch axis axis2 physics "
-    "pose sensor",
-    "SDF_JOINT axis": "xyz dynamics limit mimic use_parent_model_frame initial_position",
-    "SDF_JOINT axis dynamics": "damping friction spring_reference spring_stiffness",
-    "SDF_JOINT axis limit": "lower upper effort velocity stiffness dissipation",
-    "SDF_JOINT axis mimic": "multiplier offset reference",
-    "SDF_JOINT physics": "simbody ode provide_feedback",
-    "SDF_JOINT physics ode": "provide_feedback cfm_damping implicit_spring_damper fudge_factor cfm erp bounce max_force "
-    "velocity limit suspension",
-    "SDF_MODEL": "static self_collide allow_auto_disable frame pose link joint plugin gripper include model enable_wind",
-    "SDF_FRAME": "pose",
-    "SDF_WORLD": "audio wind include gravity magnetic_field atmosphere gui physics scene light frame joint model actor "
-    "plugin road spherical_coordinates state population",
-    "URDF_LINK": "inertial visual collision",
-    "URDF_LINK inertial": "origin mass inertia",
-    "URDF_JOINT": "origin parent child axis calibration dynamics limit mimic safety_controller",
-    "URDF_ROBOT": "link joint gazebo material transmission",
-}
-ATTRIBUTES = {
-    "SDF_LINK inertial": "auto",
-    "SDF_LINK pose": "relative_to degrees rotation_format",
-    "SDF_JOINT": "name type",
-    "SDF_JOINT axis xyz": "expressed_in",
-    "SDF_JOINT axis mimic": "joint axis",
-    "SDF_MODEL": "name namespace canonical_link placement_frame",
-    "SDF_FRAME": "name attached_to",
-    "URDF_LINK inertial origin": "xyz rpy",
-    "URDF_LINK inertial mass": "value",
-    "URDF_LINK inertial inertia": "ixx ixy ixz iyy iyz izz",
-    "URDF_JOINT axis": "xyz",
-    "URDF_JOINT limit": "lower upper effort velocity",
-    "URDF_JOINT dynamics": "damping friction",
-    "URDF_JOINT mimic": "joint multiplier offset",
-}
-
-
-def part(path: str):
-    table, *tags = path.split()
-    entry = getattr(unread, table)
-    for tag in tags:
-        entry = entry.children[tag]
-    return entry
-
-
-def leaves(entry, path=()):
-    """All entries of a table below a part, with the tags on the way."""
-    for tag, child in entry.children.items():
-        yield (*path, tag), child
-        if isinstance(child, Part):
-            yield from leaves(child, (*path, tag))
-
-
-def test_tables_have_all_elements_of_the_formats():
-    for path, words in FORMATS.items():
-        assert set(words.split()) <= part(path).children.keys(), path
-    for path, words in ATTRIBUTES.items():
-        assert set(words.split()) <= set(part(path).attributes), path
-
-
-def test_parts_that_count_as_read_occur_in_the_readers():
-    """A table that calls an element read, and a reader that does not know its name, contradict each other."""
-    text = "".join(path.read_text() for path in sorted(SOURCES.glob("*.py")) if path.name != "unread.py")
-    for name in ("SDF_LINK", "SDF_JOINT", "SDF_MODEL", "SDF_FRAME", "SDF_WORLD", "URDF_LINK", "URDF_JOINT"):
-        for path, entry in leaves(getattr(unread, name)):
-            if isinstance(entry, Part) and not entry.children:
-                words = [path[-1], *(x for x in entry.attributes if x not in ("name", "namespace", "version"))]
-                for word in words:
-                    assert re.search(rf"\b{word}\b", text), (name, path, word)
 
 
 def load(path, text: str):
@@ -240,44 +161,6 @@ def test_gravity_of_old_worlds(tmp_path):
     for version, expected in (("1.4", -3.7), ("1.5", -3.7), ("1.6", -9.8), ("1.9", -9.8)):
         scene = load(tmp_path / "r.sdf", sdf(world=physics, version=version))
         np.testing.assert_allclose(scene.system.gravity, [0, 0, expected])
-
-
-# Of the arrays of mujoco's compiled model: those without an effect on the motion of bodies (rendering, contacts and their solver,
-# user data), those that the compiler derives from others, and those that the reader reads.
-WITHOUT_EFFECT = """
-    body_bvhadr body_bvhnum body_conaffinity body_contype body_margin body_user body_plugin jnt_group jnt_margin jnt_solimp
-    jnt_solref jnt_user jnt_actgravcomp dof_solimp dof_solref site_dataid site_group site_matid site_rgba site_size site_type
-    site_user tendon_group tendon_margin tendon_matid tendon_range tendon_rgba tendon_width tendon_user tendon_solimp_fri
-    tendon_solimp_lim tendon_solref_fri tendon_solref_lim actuator_user actuator_actearly eq_solimp eq_solref sensor_user
-    sensor_history sensor_historyadr sensor_plugin key_time key_mpos key_mquat key_plastic opt_ccd_iterations
-    opt_ccd_tolerance opt_cone opt_enableflags opt_impratio opt_integrator opt_iterations opt_jacobian opt_ls_iterations
-    opt_ls_tolerance opt_magnetic opt_noslip_iterations opt_noslip_tolerance opt_o_friction opt_o_margin opt_o_solimp
-    opt_o_solref opt_sdf_initpoints opt_sdf_iterations opt_sleep_tolerance opt_solver opt_timestep opt_tolerance opt_wind
-    opt_apirate
-"""
-DERIVED = """
-    body_dofadr body_dofnum body_geomadr body_geomnum body_invweight0 body_rootid body_simple body_subtreemass body_treeid
-    body_weldid jnt_actuatorid jnt_springyield dof_M0 dof_Madr dof_bodyid dof_invweight0 dof_length dof_parentid dof_simplenum
-    dof_treeid site_sameframe tendon_actfrcrange tendon_actuatorid tendon_invweight0 tendon_springyield tendon_treeid
-    tendon_treenum tendon_type actuator_acc0 actuator_cranklength actuator_ctrlspec actuator_history actuator_historyadr
-    actuator_length0 actuator_lengthrange actuator_outadr sensor_adr sensor_datatype sensor_dim sensor_intprm sensor_needstage
-    sensor_reftype body_dofnum tendon_dampingpoly
-"""
-
-
-def test_arrays_of_compiled_models_are_read_or_without_effect():
-    """A release of mujoco with another array has it here, or fails."""
-    model = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
-    )
-    text = "".join(path.read_text() for path in sorted(SOURCES.glob("mjcf*.py")))
-    known = {*WITHOUT_EFFECT.split(), *DERIVED.split()}
-    prefixes = ("body_", "jnt_", "dof_", "site_", "tendon_", "wrap_", "actuator_", "eq_", "sensor_", "key_")
-    names = [name for name in dir(model) if name.startswith(prefixes)]
-    names += [f"opt_{name}" for name in dir(model.opt) if not name.startswith("_")]
-    for name in names:
-        word = name.replace("opt_", "opt.") if name.startswith("opt_") else name
-        assert name in known or word in text or f'"{name.removeprefix("opt_")}"' in text, name
 
 
 def test_flags_of_mjcf_files(tmp_path):

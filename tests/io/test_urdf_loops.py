@@ -191,12 +191,12 @@ def test_plugins_that_mimic_fixed_joints(tmp_path):
     free = jd.load(write(tmp_path)).system
     held = jd.load(write(tmp_path, extra=fixed + plugin("still", "c"))).system
     assert set(free.joint_names) - set(held.joint_names) == {"c"}
-    reference = jd.load_urdf(tmp_path / "bars.urdf", lock={"c": 0.3})
+    reference = jd.load_model(tmp_path / "bars.urdf", lock={"c": 0.3})
     np.testing.assert_allclose(held.frame_poses, reference.frame_poses, atol=1e-15)
     still = jd.load(write(tmp_path, extra=fixed + plugin("c", "still")))
     assert still.constraints == () and still.system.nv == free.nv
     follows = jd.load(write(tmp_path, extra=plugin("a", "c")), lock={"a": 0.1}).system
-    reference = jd.load_urdf(tmp_path / "bars.urdf", lock={"a": 0.1, "c": 0.5})
+    reference = jd.load_model(tmp_path / "bars.urdf", lock={"a": 0.1, "c": 0.5})
     np.testing.assert_allclose(follows.home, reference.home, atol=1e-15)
     assert jd.load(tmp_path / "bars.urdf", mimic="ignore").constraints == ()
     with pytest.raises(

@@ -378,7 +378,7 @@ def test_iiwa_kinematics_are_the_published_ones():
 
 def test_ur5_has_the_places_and_masses_of_its_description(robots_dir):
     """Frames against the URDF of example-robot-data, whose right angles have eleven digits; moments are ours."""
-    model, theirs = robots.ur5(), jd.load_urdf(robots_dir / "ur_description" / "urdf" / "ur5_robot.urdf")
+    model, theirs = robots.ur5(), jd.load_model(robots_dir / "ur_description" / "urdf" / "ur5_robot.urdf")
     assert model.nv == 6 and jd.model.inertia_report(model) == []
     np.testing.assert_allclose(model.inertias[:, :4], theirs.inertias[:, :4], atol=1e-9)
     np.testing.assert_allclose(model.upper, theirs.upper, rtol=1e-11)

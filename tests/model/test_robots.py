@@ -1,4 +1,4 @@
-"""Robots of example-robot-data, read by `load_urdf`, against Pinocchio reading the same file."""
+"""Robots of example-robot-data, read by `load_model`, against Pinocchio reading the same file."""
 
 import jax
 import jax.numpy as jnp
@@ -121,4 +121,4 @@ def test_refused_robots_say_why(file):
     if file not in ROBOT_FILES:
         pytest.skip(f"{file} is not in this release of example-robot-data")
     with pytest.raises(ValueError, match=REFUSED[file]):
-        jd.load_urdf(ROBOT_FILES[file])
+        jd.load_model(ROBOT_FILES[file])

@@ -189,7 +189,7 @@ def test_a_flat_parallelogram_has_a_freedom_more():
 
 
 def test_fixed_joints_name_frames(urdf):
-    model = jd.load_urdf(urdf)
+    model = jd.load_model(urdf)
     q = jnp.array([0.4])
     np.testing.assert_array_equal(jd.frame_pose(model, q, "mount"), jd.frame_pose(model, q, "tool"))
     np.testing.assert_array_equal(jd.body_jacobian(model, q, "shoulder"), jd.body_jacobian(model, q, "upper"))

@@ -11,7 +11,7 @@ import pytest
 
 import jaxdyn as jd
 from benchmarks import gpu, gpu_model
-from jaxdyn.compile.trigonometry import cosine, sine
+from jaxdyn.compile.operations import cosine, sine
 
 
 def test_forward_dynamics_calls_no_library_and_no_host():

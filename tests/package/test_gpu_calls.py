@@ -17,7 +17,7 @@ import jaxdyn as jd
 from benchmarks import gpu as benchmark
 from jaxdyn import compile as backend
 from jaxdyn.compile import jax_adapter, mode, primitive
-from jaxdyn.compile.gpu import device, driver, ptx
+from jaxdyn.compile.gpu import device, ptx
 
 pytestmark = pytest.mark.native
 
@@ -29,7 +29,7 @@ RNG = np.random.default_rng(0)
 def of_process():
     """XLA calls kernels for GPUs on the CPU, by a driver that is none."""
     patch, stand_in = pytest.MonkeyPatch(), gpu_stand_in.StandInDriver()
-    of_gpus = driver.Driver(stand_in)
+    of_gpus = device.Driver(stand_in)
     usual = jax_adapter.register_handler
 
     def register_handler(name, address, platform):
@@ -334,16 +334,16 @@ def test_a_build_of_llvm_without_the_target_is_unsupported(monkeypatch):
 def test_a_driver_that_fails_at_its_start_is_unsupported_by_name(name, monkeypatch):
     stand_in = gpu_stand_in.StandInDriver()
     stand_in.fails = name
-    monkeypatch.setattr(driver, "open_library", lambda: stand_in)
+    monkeypatch.setattr(device, "open_library", lambda: stand_in)
     with pytest.raises(jax_adapter.Unsupported, match=f"^{name} of CUDA's driver failed"):
-        driver.driver.__wrapped__()
+        device.driver.__wrapped__()
 
 
 def test_a_driver_without_a_function_is_unsupported():
     missing = "cuModuleLoadDataEx"
-    names = {name: getattr(gpu_stand_in.StandInDriver(), name) for name in driver._FUNCTIONS if name != missing}
+    names = {name: getattr(gpu_stand_in.StandInDriver(), name) for name in device._FUNCTIONS if name != missing}
     with pytest.raises(jax_adapter.Unsupported, match=f"no function {missing}"):
-        driver.Driver(SimpleNamespace(**names))
+        device.Driver(SimpleNamespace(**names))
 
 
 def test_the_driver_is_found_under_its_names(monkeypatch):
@@ -355,15 +355,15 @@ def test_the_driver_is_found_under_its_names(monkeypatch):
             raise OSError(name)
         return name
 
-    monkeypatch.setattr(driver.ctypes, "CDLL", lambda name: find(name, ["libcuda.so"]))
-    monkeypatch.setattr(driver.sys, "platform", "linux")
-    assert driver.open_library() == "libcuda.so" and asked == ["libcuda.so.1", "libcuda.so"]
-    monkeypatch.setattr(driver.ctypes, "CDLL", find)
+    monkeypatch.setattr(device.ctypes, "CDLL", lambda name: find(name, ["libcuda.so"]))
+    monkeypatch.setattr(device.sys, "platform", "linux")
+    assert device.open_library() == "libcuda.so" and asked == ["libcuda.so.1", "libcuda.so"]
+    monkeypatch.setattr(device.ctypes, "CDLL", find)
     with pytest.raises(jax_adapter.Unsupported, match=r"CUDA's driver is not installed \(libcuda\.so\.1\)"):
-        driver.open_library()
-    monkeypatch.setattr(driver.sys, "platform", "win32")
+        device.open_library()
+    monkeypatch.setattr(device.sys, "platform", "win32")
     with pytest.raises(jax_adapter.Unsupported, match=r"nvcuda\.dll"):
-        driver.open_library()
+        device.open_library()
 
 
 @pytest.mark.parametrize(
@@ -376,12 +376,12 @@ def test_the_driver_is_found_under_its_names(monkeypatch):
 )
 def test_old_drivers_and_devices_are_unsupported(options, message):
     with pytest.raises(jax_adapter.Unsupported, match=message):
-        driver.Driver(gpu_stand_in.StandInDriver(**options))
+        device.Driver(gpu_stand_in.StandInDriver(**options))
 
 
 def test_without_a_driver_functions_run_on_jax_after_one_warning(caplog, monkeypatch):
-    monkeypatch.setattr(device, "driver", driver.driver.__wrapped__)
-    monkeypatch.setattr(driver, "open_library", refuse)
+    monkeypatch.setattr(device, "driver", device.driver.__wrapped__)
+    monkeypatch.setattr(device, "open_library", refuse)
     monkeypatch.setattr(device, "register", device.register.__wrapped__)
     monkeypatch.setattr(mode, "_said", set())
     with jd.compilation("native"), caplog.at_level(logging.WARNING, "jaxdyn"):

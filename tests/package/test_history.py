@@ -10,7 +10,7 @@ import pytest
 
 import jaxdyn as jd
 from benchmarks import history
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import on_one_thread
 
 
 @pytest.mark.slow
@@ -54,7 +54,7 @@ def test_jit_keeps_a_program_for_each_mode():
 
 def test_calls_that_overlap_give_the_threads_of_linear_algebra_back(monkeypatch):
     """Each for itself would take the limit that the other one has set for the user's."""
-    from jaxdyn.identify import devices
+    from jaxdyn.identify import descent
 
     process = {"limit": 8}
 
@@ -66,7 +66,7 @@ def test_calls_that_overlap_give_the_threads_of_linear_algebra_back(monkeypatch)
         def restore_original_limits(self):
             process["limit"] = self.before
 
-    monkeypatch.setattr(devices, "threadpool_limits", Limits)
+    monkeypatch.setattr(descent, "threadpool_limits", Limits)
     inside, go_on, seen = threading.Event(), threading.Event(), []
 
     @on_one_thread

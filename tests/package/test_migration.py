@@ -41,7 +41,7 @@ def agree(section: str, theirs: dict, ours: dict, rtol: float) -> None:
 @pytest.mark.slow
 def test_calls_of_pinocchio(robots_dir):
     path = str(robots_dir / "ur_description" / "urdf" / "ur5_robot.urdf")
-    model, robot = pin.buildModelFromUrdf(path), jd.load_urdf(path)
+    model, robot = pin.buildModelFromUrdf(path), jd.load_model(path)
     q, v, a, tau, u = np.random.default_rng(0).normal(size=(5, robot.nv)) * 0.5
     tip = model.frames[model.nframes - 1].name
     names = {"model": model, "data": model.createData(), "pin": pin, "W": pin.LOCAL_WORLD_ALIGNED}
@@ -56,7 +56,7 @@ def of_mujoco(tmp_path):
     (tmp_path / "arm.xml").write_text(ARM)
     m = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
     d = mujoco.MjData(m)
-    robot = jd.io.load_mjcf(tmp_path / "arm.xml").system
+    robot = jd.load(tmp_path / "arm.xml").system
     q, v = np.array([0.3, -0.5, 0.8]), np.array([0.4, 0.2, -0.6])
     d.qpos[:], d.qvel[:] = q, v
     mujoco.mj_forward(m, d)

@@ -268,7 +268,7 @@ model = jd.robots.chain(2)
 jd.forward_dynamics(model, np.ones(2), np.ones(2), np.ones(2))
 jax.jit(jax.grad(lambda q: jd.potential_energy(model, q)))(np.ones(2, np.float32))
 jd.scenes.four_bar()
-jd.io.load_mjcf
+jd.load
 names = {"diffrax", "lineax", "matplotlib", "optax", "optimistix", "scipy", "jaxdyn.simulation"}
 assert not names & sys.modules.keys(), names & sys.modules.keys()
 """)
@@ -338,90 +338,6 @@ def test_excluded_jax_is_neither_installed_nor_allowed():
     pins = [line for line in project["dependencies"] if re.match(r"jax(lib)?[^a-z]", line)]
     assert len(pins) == 2
     assert all("!=0.10.2" in line for line in pins)
-
-
-def definition(dotted: str) -> tuple[str, ast.AST | None]:
-    """The module of a dotted name, and the function or class that the name means, through re-exports; None for a module."""
-    module = internal(dotted)
-    name = dotted.removeprefix(".".join(filter(None, ("jaxdyn", module)))).strip(".")
-    if module is None or not name:
-        return module or "", None
-    for node in SOURCES[module].body:
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and node.name == name:
-            return module, node
-    source = imported_as(module).get(name)
-    return definition(source) if source else (module, None)
-
-
-def imported_as(module: str) -> dict[str, str]:
-    """Names that a module imports from others, each with the dotted name of what it is."""
-    nodes = [node for node in SOURCES[module].body if isinstance(node, ast.ImportFrom)]
-    return {alias.asname or alias.name: f"{node.module}.{alias.name}" for node in nodes for alias in node.names}
-
-
-def public(module: str = "") -> Iterator[tuple[str, ast.AST]]:
-    """Functions and classes that the package and its public groups name, with the modules where they stand."""
-    names = imported_as(module)
-    if module and not (PACKAGE.joinpath(*module.split(".")) / "__init__.py").exists():
-        names = {}  # a module that is a group by itself imports for its own use
-    for dotted in (dotted for name, dotted in names.items() if not name.startswith("_")):
-        home, node = definition(dotted)
-        if node is not None:
-            yield home, node
-        elif dotted == f"jaxdyn.{home}":
-            yield from public(home)
-    for node in SOURCES[module].body:
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
-            yield module, node
-
-
-def bases(module: str, node: ast.ClassDef) -> Iterator[tuple[str, ast.ClassDef]]:
-    """A class and those of this package that it inherits from."""
-    yield module, node
-    for base in node.bases:
-        name = name_of(base.value if isinstance(base, ast.Subscript) else base)
-        home, parent = definition(".".join(filter(None, ("jaxdyn", module, name))))
-        if isinstance(parent, ast.ClassDef):
-            yield from bases(home, parent)
-
-
-# Types that say nothing.
-VAGUE = {"Any", "Any | None", "Optional[Any]", "object"}
-
-
-def vague(function: ast.FunctionDef, is_method: bool) -> list[str]:
-    """Parameters of a function without a type, or with `Any`, and "return"; those of `**options` may be anything."""
-    signature = function.args
-    parameters = [*signature.posonlyargs, *signature.args]
-    if is_method and not any(name_of(mark) == "staticmethod" for mark in function.decorator_list):
-        parameters = parameters[1:]
-    types = {one.arg: one.annotation for one in [*parameters, *signature.kwonlyargs, signature.vararg] if one}
-    if function.name != "__init__":
-        types["return"] = function.returns
-    wrong = [name for name, given in types.items() if given is None or ast.unparse(given).strip("'\"") in VAGUE]
-    return wrong + ([] if signature.kwarg is None or signature.kwarg.annotation else [signature.kwarg.arg])
-
-
-def test_public_signatures_say_what_they_take_and_return():
-    """`PyTree` says that a value may be any tree of arrays; `Checked[T]`, that a function looks at it by itself."""
-    functions = {}
-    for home, node in public():
-        if isinstance(node, ast.FunctionDef):
-            functions[f"{home}:{node.name}"] = vague(node, is_method=False)
-            for mark in node.decorator_list:  # the start of a named scene, `jd.scenes.<name>.start`
-                if isinstance(mark, ast.Call) and name_of(mark.func) == "register_scene":
-                    _, start = definition(f"jaxdyn.{home}.{name_of(mark.args[0])}")
-                    functions[f"{home}:{node.name}.start"] = vague(start, is_method=False)
-            continue
-        for module, owner in bases(home, node):
-            for method in owner.body:
-                if isinstance(method, ast.FunctionDef) and (
-                    not method.name.startswith("_") or method.name in ("__init__", "__call__")
-                ):
-                    functions[f"{module}:{owner.name}.{method.name}"] = vague(method, is_method=True)
-    assert {"simulation.run:simulate", "model.tree:Model.replace", "scenes.linkages:four_bar.start"} <= functions.keys()
-    wrong = [f"{place}: {', '.join(names)}" for place, names in functions.items() if names]
-    assert not wrong, "\n".join(wrong)
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float64, 1e-14), (jnp.float32, 1e-5)])

@@ -143,7 +143,7 @@ def test_solids_of_urdf(urdf, solids):
     assert volume(*mesh.triangles()) == pytest.approx(8 / 6, rel=1e-12)  # twice as large as in its file
     np.testing.assert_allclose(box.pose[:3, :3], host_math.rotation_from_rpy((0, 0, 0.3)))
     # The lower arm has the tip's ball; nothing of inertia is added to bodies that have a solid.
-    model = jd.load_urdf(urdf)
+    model = jd.load_model(urdf)
     assert {shape.source for shape in default_solids.complete_solids(jd.Scene(model), solids)} == {"file"}
     whole = default_solids.complete_solids(jd.Scene(model), Shapes([box]))
     assert [shape.frame for shape in whole if shape.source == "inertia"] == ["lower"]
@@ -416,7 +416,7 @@ def test_draw_and_animate(turning, solids, urdf, tmp_path):
 
     with Image.open(tmp_path / "turn.gif") as picture:
         assert picture.n_frames == 5  # of 0.4 s
-    jd.draw(jd.load_urdf(urdf), jnp.asarray([0.3, -0.2]), axes, shapes=solids)
+    jd.draw(jd.load_model(urdf), jnp.asarray([0.3, -0.2]), axes, shapes=solids)
 
 
 def test_draw_refuses(turning, tmp_path):

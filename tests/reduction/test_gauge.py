@@ -12,7 +12,7 @@ from jaxdyn.constraints import Pfaffian
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, projections
 from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.reduction.quasi_velocities import gauge_invariant
+from jaxdyn.reduction.minimal import gauge_invariant
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 

@@ -20,10 +20,8 @@ from jaxdyn.cli import main
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.reports import Record, Report, html_page, pareto_front
 from jaxdyn.reports import run as running
-from jaxdyn.reports.case import Case, Reference, case_of_scene
-from jaxdyn.reports.measurement import Contestant, Motion, evaluations, ladder, measure
-from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
-from jaxdyn.reports.records import SceneReference
+from jaxdyn.reports.page import SceneReference
+from jaxdyn.reports.programs import FIXED, SOLVERS, Case, Programs, Reference, case_of_scene, prepare
 from jaxdyn.reports.references import (
     CLOSED_FORMS,
     coin,
@@ -39,7 +37,7 @@ from jaxdyn.reports.references import (
     turntable,
     windows,
 )
-from jaxdyn.reports.timing import time_interleaved
+from jaxdyn.reports.run import Contestant, Motion, evaluations, ladder, measure, time_interleaved
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import choose_solver
@@ -466,8 +464,8 @@ def test_command(small, rungs, capsys):
         (["report", "free_body", "--rounds", "0"], "--rounds is 0"),
         (["report", "free_body", "--integrator", "Dopri8"], "integrators"),
         (["report", "free_body", "--integrator", "free:Euler"], "Euler"),
-        (["report", "four_bar", "free_body", "--way", "projected:Dopri8"], "free_body does not support"),
-        (["report", "free_body", "--way", "fre:Dopri8"], "integrators"),
+        (["report", "four_bar", "free_body", "--integrator", "projected:Dopri8"], "free_body does not support"),
+        (["report", "free_body", "--integrator", "fre:Dopri8"], "integrators"),
     ):
         assert main(wrong) == 2
         assert word in capsys.readouterr().err
@@ -497,8 +495,7 @@ def test_a_scene_of_ones_own(rungs, monkeypatch):
     coarse, fine = (record.error_path for record in measured.records)
     fine_setting = measured.records[1].setting
     assert fine < 1e-8 < coarse < 1e-2
-    with pytest.warns(DeprecationWarning, match="pass `integrators`"):
-        several = jd.report(case, rounds=1, ways=[("free", "Dopri8")], dtypes=("float32", "float64"), batches=(1, 3))
+    several = jd.report(case, rounds=1, integrators=[("free", "Dopri8")], dtypes=("float32", "float64"), batches=(1, 3))
     found = {(record.dtype, record.batch, record.solver) for record in several.records}
     assert found == {(dtype, batch, "Dopri8") for dtype in ("float32", "float64") for batch in (1, 3)}
     # The fine rung in float64 is that of before; float32 has its rounding.

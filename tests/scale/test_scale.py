@@ -1,5 +1,6 @@
 """Batches of any size into a store: rows, interruptions, reductions, and how they say no; test_scale_dask.py has clusters."""
 
+import dataclasses
 import errno
 import functools
 import itertools
@@ -23,13 +24,15 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.scale import program
 from jaxdyn.scale import store as stores
-from jaxdyn.scale.batch import lock_store
-from jaxdyn.scale.members import members
+from jaxdyn.scale.program import members
+from jaxdyn.scale.run import Resources
+from jaxdyn.scale.store import lock_store
 
 zarr = pytest.importorskip("zarr", reason="zarr is not installed: the extra scale")
 xarray = pytest.importorskip("xarray", reason="xarray is not installed: the extra scale")
 
-QUIET = {"progress": False}
+QUIET = {"resources": Resources(progress=False)}
+OF_RESOURCES = [one.name for one in dataclasses.fields(Resources)]
 
 
 def square(p):
@@ -41,8 +44,9 @@ def drawn(key):
     return {"x": jax.random.uniform(key, (), minval=1.0, maxval=2.0)}
 
 
-def evaluated(out, samples=23, chunk=5, function=square, parameters=drawn, **options):
-    return jd.scale.evaluate(function, parameters, samples=samples, out=out, chunk=chunk, **QUIET | options)
+def evaluated(out, samples=23, function=square, parameters=drawn, **options):
+    own = {"chunk": 5, "progress": False} | {name: options.pop(name) for name in OF_RESOURCES if name in options}
+    return jd.scale.evaluate(function, parameters, samples=samples, out=out, resources=Resources(**own), **options)
 
 
 def files(path):
@@ -89,11 +93,10 @@ def pendulums(tmp_path_factory):
             {"damping": lengths},
             ts,
             out=out,
-            chunk=8,
             stepsize=0.01,
             outputs=("energy",),
             units={"damping": "N m s"},
-            **QUIET,
+            resources=Resources(chunk=8, progress=False),
         )
 
     return again(), build, starts, lengths, ts, again
@@ -173,11 +176,9 @@ def test_motions_do_not_depend_on_devices_and_batches(pendulums, tmp_path):
         {"damping": damping},
         ts,
         out=tmp_path / "b.zarr",
-        batch_size=5,
-        devices=jax.local_devices()[:1],
         stepsize=0.01,
         outputs=("energy",),
-        **QUIET,
+        resources=Resources(batch_size=5, devices=jax.local_devices()[:1], progress=False),
     )
     assert_equal(arrays(one_device.out), arrays(run.out))
 
@@ -223,8 +224,8 @@ def drawn(key):
 def logistic(x):
     return {"x": jax.lax.fori_loop(0, 300_000, lambda _, x: 3.9 * x * (1 - x), x)}
 
-found = jd.scale.evaluate(logistic, drawn, samples=160, batch_size=4, chunk=4, out=sys.argv[1], progress=False,
-                          reductions={"x": jd.scale.Mean("x")})
+found = jd.scale.evaluate(logistic, drawn, samples=160, out=sys.argv[1], reductions={"x": jd.scale.Mean("x")},
+                          resources=jd.scale.Resources(batch_size=4, chunk=4, progress=False))
 print(found.computed)
 """
 
@@ -282,8 +283,8 @@ def slow_here(out):
     """What `SLOW` computes, in this process."""
     source: dict = {}
     exec(SLOW.split("found =")[0].replace("jax.config.update(", "(lambda *_: None)("), source)
-    options = {"samples": 160, "batch_size": 4, "chunk": 4, "reductions": {"x": jd.scale.Mean("x")}} | QUIET
-    return jd.scale.evaluate(source["logistic"], source["drawn"], out=out, **options)
+    options = {"samples": 160, "batch_size": 4, "chunk": 4, "reductions": {"x": jd.scale.Mean("x")}}
+    return evaluated(out, function=source["logistic"], parameters=source["drawn"], **options)
 
 
 # Stores that are not what they should be
@@ -418,10 +419,9 @@ def test_failures_are_rows_with_codes(tmp_path):
         None,
         jnp.linspace(0.0, 0.1, 3),
         out=tmp_path / "a.zarr",
-        chunk=4,
         stepsize=0.05,
         reductions={"q": jd.scale.Mean("q")},
-        **QUIET,
+        resources=Resources(chunk=4, progress=False),
     )
     assert run.codes == {"successful": 7, "nonfinite_start": 2} and not run.success
     assert list(run.failed) == [2, 7] and "2 nonfinite_start" in str(run)
@@ -525,7 +525,7 @@ def test_chunks_without_rollouts_change_no_bit_of_a_result(reduction):
 
 
 def test_a_run_of_many_chunks_merges_as_they_come():
-    from jaxdyn.scale.reducer import Reducer, Totals
+    from jaxdyn.scale.reductions import Reducer, Totals
     from jaxdyn.scale.study import Summary
 
     values = np.random.default_rng(3).random(199)
@@ -743,7 +743,7 @@ def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     table = xarray.open_zarr(tmp_path / "a.zarr", chunks=None)
     # XLA may draw a number anew where it is used, and contracts products and sums as it likes: the last digit differs.
     np.testing.assert_allclose(table.q[:, 0], table.parameter_q0, rtol=4e-16)
-    assert list(table.coordinate.values) == list(jd.load_urdf(tmp_path / "arm.urdf").joint_names)
+    assert list(table.coordinate.values) == list(jd.load_model(tmp_path / "arm.urdf").joint_names)
     study.write_text(head + 'scene = "chaplygin_sleigh"\n[parameters]\nmass = { uniform = [1.0, 2.0] }\n')
     assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "b.zarr")]) == 0
     drawn = xarray.open_zarr(tmp_path / "b.zarr", chunks=None)
@@ -797,9 +797,8 @@ def test_keywords_of_evaluate_and_run(tmp_path):
         seed=7,
         rows=["z", "parameter_x"],
         units={"z": "1/m", "x": "m"},
-        batch_size=2,
         reductions={"mean": jd.scale.Mean("z")},
-        progress=False,
+        resources=Resources(batch_size=2, progress=False),
     )
     table = run.dataset()
     np.testing.assert_allclose(table["z"], 1 / x, rtol=1e-14)
@@ -807,6 +806,12 @@ def test_keywords_of_evaluate_and_run(tmp_path):
     assert "y" not in table and table["z"].attrs["units"] == "1/m" and table["parameter_x"].attrs["units"] == "m"
     np.testing.assert_allclose(run.reductions["mean"]["mean"], np.mean(1 / x), rtol=1e-14)
     assert run.batch_size == 2
+    options = {"samples": 6, "seed": 7, "rows": ["z", "parameter_x"], "reductions": {"mean": jd.scale.Mean("z")}}
+    with pytest.warns(DeprecationWarning, match="chunk, progress of jd.scale are now fields"):
+        again = jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", chunk=3, progress=False, **options)
+    assert again.computed == 0
+    with pytest.raises(TypeError, match="no argument lanes"):
+        jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", lanes=3, **options)
 
 
 @pytest.mark.long
@@ -818,7 +823,8 @@ def test_seed_rows_retries_and_progress_of_runs(tmp_path, capsys, monkeypatch):
     def simulated(name, retries=2, progress=False):
         return jd.scale.run(
             model.build(), lambda p: (jnp.zeros(1), p["v"][None]), lambda key: {"v": jax.random.normal(key, ())},
-            np.array([0.0, 2.0]), samples=4, out=tmp_path / name, seed=3, rows=["q"], retries=retries, progress=progress,
+            np.array([0.0, 2.0]), samples=4, out=tmp_path / name, seed=3, rows=["q"],
+            resources=Resources(retries=retries, progress=progress),
         )  # fmt: skip
 
     run = simulated("a.zarr", progress=True)

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
+from jaxdyn.scale.run import Resources
 from jaxdyn.tasks import Cluster, Failure, map_tasks, package_versions
 
 for package in ("zarr", "xarray", "filelock", "cloudpickle"):
@@ -32,7 +33,6 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning"),
     pytest.mark.filterwarnings("ignore:.*unclosed:pytest.PytestUnraisableExceptionWarning"),
 ]
-QUIET = {"progress": False}
 LONG = 120.0  # s, in which what is waited for has to happen
 
 
@@ -46,7 +46,7 @@ def study(iterations=100):
         return {"x": jax.lax.fori_loop(0, iterations, lambda _, x: 3.9 * x * (1 - x), x)}
 
     reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
-    return (logistic, draw), {"samples": 240, "batch_size": 4, "chunk": 4, "reductions": reductions} | QUIET
+    return (logistic, draw), {"samples": 240, "reductions": reductions}
 
 
 SLOW = 300_000
@@ -54,7 +54,8 @@ SLOW = 300_000
 
 def evaluate(out, client=None, iterations=100, **options):
     args, given = study(iterations)
-    return jd.scale.evaluate(*args, out=out, client=client, **given | options)
+    resources = Resources(client, batch_size=4, chunk=4, **{"progress": False} | options)
+    return jd.scale.evaluate(*args, out=out, resources=resources, **given)
 
 
 def files(path):
@@ -176,11 +177,7 @@ def test_motions_are_the_same(client, tmp_path):
             np.array([0.0, 0.2]),
             out=tmp_path / name,
             control=lambda q, v, t: -gain * v,
-            chunk=4,
-            batch_size=4,
-            client=client,
-            devices=devices,
-            **QUIET,
+            resources=Resources(client, devices=devices, batch_size=4, chunk=4, progress=False),
         )
 
     here, there = run("a.zarr", devices=jax.local_devices()[:1]), run("b.zarr", client)
@@ -244,8 +241,8 @@ def logistic(x):
 if __name__ == "__main__":
     reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
     with Client(sys.argv[1]) as client:
-        print(jd.scale.evaluate(logistic, draw, samples=240, batch_size=4, chunk=4, out=sys.argv[2], client=client,
-                                reductions=reductions, progress=False).computed)
+        print(jd.scale.evaluate(logistic, draw, samples=240, out=sys.argv[2], reductions=reductions,
+                                resources=jd.scale.Resources(client, batch_size=4, chunk=4, progress=False)).computed)
 """
 
 
@@ -429,17 +426,17 @@ def failing(bad, times, folder):
 @pytest.mark.parametrize("where", ["here", "cluster"])
 def test_a_chunk_that_raises_is_tried_again_and_reported(client, tmp_path, where):
     client = client if where == "cluster" else None
-    options = {"chunk": 5, "batch_size": 5, "out": tmp_path / "a.zarr", "client": client} | QUIET
+    options = {"chunk": 5, "batch_size": 5, "client": client, "progress": False}
     starts = np.arange(40.0)
     function = failing((12.0, 33.0), 2, tmp_path)
     with pytest.raises(
         RuntimeError, match=r"of 8 chunks 2 failed in every attempt \(2, 6\), the others are finished"
     ) as caught:
-        jd.scale.evaluate(function, starts, retries=0, **options)
+        jd.scale.evaluate(function, starts, out=tmp_path / "a.zarr", resources=Resources(retries=0, **options))
     assert "Chunk 2:\nTraceback" in str(caught.value) and "12.0 is a bad start" in str(caught.value)
     assert recorded(tmp_path / "a.zarr") == 6
     # A second failure each, and a third attempt that succeeds.
-    run = jd.scale.evaluate(function, starts, retries=1, **options)
+    run = jd.scale.evaluate(function, starts, out=tmp_path / "a.zarr", resources=Resources(retries=1, **options))
     assert run.success and run.computed == 10
     np.testing.assert_array_equal(run.dataset().y, starts + 1.0)
 
@@ -505,11 +502,13 @@ def test_functions_of_modules_that_workers_lack_are_named(client, tmp_path, monk
     monkeypatch.syspath_prepend(tmp_path)
     import of_the_client  # pyright: ignore[reportMissingImports]
 
+    resources = Resources(client, progress=False)
+
     with pytest.raises(ModuleNotFoundError, match=r"of_the_client.*client\.upload_file"):
-        jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", client=client, **QUIET)
+        jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", resources=resources)
     assert not (tmp_path / "a.zarr").exists()
     client.upload_file(str(tmp_path / "of_the_client.py"))
-    run = jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", client=client, **QUIET)
+    run = jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", resources=resources)
     np.testing.assert_array_equal(run.dataset().y, np.arange(4.0) ** 2)
 
 

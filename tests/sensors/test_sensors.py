@@ -65,12 +65,12 @@ def test_mujoco_reads_the_same(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     from mujoco_bridge import Oracle
 
-    from jaxdyn.io import NotTakenWarning, load_mjcf
+    from jaxdyn.io import NotTakenWarning
 
     path = tmp_path / "robot.xml"
     path.write_text(FILE)
     with pytest.warns(NotTakenWarning, match="sensors: now"):
-        scene = load_mjcf(path)
+        scene = jd.load(path)
     oracle = Oracle(path, scene.system)
     rng = np.random.default_rng(1)
     q = np.asarray(scene.starts["reference"].q) + 0.3 * rng.normal(size=scene.nq)
@@ -279,7 +279,7 @@ def test_outer_forces_springs_and_stops_against_mujoco(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     path = tmp_path / "pushed.xml"
     path.write_text(PUSHED)
-    m, loaded = mujoco.MjModel.from_xml_path(str(path)), jd.io.load_mjcf(path)
+    m, loaded = mujoco.MjModel.from_xml_path(str(path)), jd.load(path)
     data = mujoco.MjData(m)
     q, v = np.array([0.3, -0.7, 0.5]), np.array([1.2, -0.8, 0.9])
     data.qpos[:], data.qvel[:] = q, v
@@ -407,7 +407,7 @@ def test_thrusts_act_where_they_are(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     path = tmp_path / "flyer.xml"
     path.write_text(FLYER)
-    m, scene = mujoco.MjModel.from_xml_path(str(path)), jd.io.load_mjcf(path)
+    m, scene = mujoco.MjModel.from_xml_path(str(path)), jd.load(path)
     data, control = mujoco.MjData(m), np.array([2.0, 3.0, -0.7, 0.4, 0.5])
     data.qpos[:], data.qvel[:], data.ctrl[:] = [0.3, -0.4, 0.5], [0.7, -1.0, 0.4], control
     mujoco.mj_forward(m, data)

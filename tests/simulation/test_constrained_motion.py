@@ -17,13 +17,14 @@ from jaxdyn.compile import compilation
 from jaxdyn.constraints import Holonomic, lock_joint
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.simulation.methods import Multipliers
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem
 
-TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+TIGHT = {"stepsize": Steps(rtol=1e-12, atol=1e-12)}
 
 
 def motion(scene, state, ts, **options):
@@ -62,7 +63,9 @@ def test_a01_pendulum_in_plane():
 @pytest.mark.long
 def test_car_axis():
     """Moving constraints, all components at t = 3 (published, quadruple precision)."""
-    computed = motion(test_set.car_axis(), test_set.car_axis.start(), [0.0, 3.0], rtol=1e-11, atol=1e-11)
+    computed = motion(
+        test_set.car_axis(), test_set.car_axis.start(), [0.0, 3.0], stepsize=Steps(rtol=1e-11, atol=1e-11)
+    )
     q = [0.493455784275402809122e-1, 0.496989460230171153861, 0.104174252488542151681e1, 0.373911027265361256927]
     v = [-0.770583684040972357970e-1, 0.744686658723778553466e-2, 0.175568157537232222276e-1, 0.770341043779251976443]
     np.testing.assert_allclose(computed.q[-1], q, atol=1e-9)
@@ -72,7 +75,9 @@ def test_car_axis():
 @pytest.mark.slow
 def test_andrews():
     """Positions published to 1e-10, velocities to 5e-8 relative; the energy balance is exact."""
-    computed = motion(test_set.andrews(), test_set.andrews.start(), [0.0, 0.01, 0.02, 0.03], rtol=1e-13, atol=1e-13)
+    computed = motion(
+        test_set.andrews(), test_set.andrews.start(), [0.0, 0.01, 0.02, 0.03], stepsize=Steps(rtol=1e-13, atol=1e-13)
+    )
     q = [15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948]
     q += [0.5244099658805304, 0.5347301163226948, 1.048080741042263]
     v = [1139.920302151208, -1424.379294994111, 11.03291221937134, 19.29337464421385]
@@ -187,10 +192,11 @@ def test_projection_keeps_the_order(solver, order):
     @quick
     def run(step):
         # Of the implicit method's inner iteration.
-        tolerances = {"rtol": 1e-12, "atol": 1e-12} if isinstance(solver, diffrax.Kvaerno5) else {}
-        return simulate(scene, q, v, ts, stepsize=step, solver=solver, max_steps=512, **tolerances).q
+        tolerance = 1e-12 if isinstance(solver, diffrax.Kvaerno5) else None
+        steps = Steps(step, rtol=tolerance, atol=tolerance, max_steps=512)
+        return simulate(scene, q, v, ts, stepsize=steps, solver=solver).q
 
-    exact = quick(lambda: simulate(scene, q, v, ts, rtol=1e-13, atol=1e-13).q)()
+    exact = quick(lambda: simulate(scene, q, v, ts, stepsize=Steps(rtol=1e-13, atol=1e-13)).q)()
     steps = [0.1, 0.05] if order == 8 else [0.05, 0.025]
     errors = [np.abs(run(step)[-1] - exact[-1]).max() for step in steps]
     assert np.log2(errors[0] / errors[1]) > order - 0.6
@@ -204,7 +210,7 @@ def test_without_projection_the_constraint_opens():
 
     @quick
     def run():
-        options = {"rtol": 1e-8, "atol": 1e-8, "outputs": ("constraint_residual", "multipliers")}
+        options = {"stepsize": Steps(rtol=1e-8, atol=1e-8), "outputs": ("constraint_residual", "multipliers")}
         return simulate(scene, q, v, jnp.asarray([0.0, 10.0]), method="multipliers", **options)
 
     computed = run()
@@ -285,7 +291,7 @@ def test_rows_that_open_within_their_rank_tolerance_do_not_contradict():
     @quick
     def run(q, v):
         options = {"method": Multipliers(rank_tol=1e-4), "outputs": ("constraint_residual",)}
-        return simulate(scenes.bennett(), q, v, [0.0, 3.0], rtol=1e-5, atol=1e-5, **options)
+        return simulate(scenes.bennett(), q, v, [0.0, 3.0], stepsize=Steps(rtol=1e-5, atol=1e-5), **options)
 
     computed = run(*start)
     assert computed.success and 1e-7 < float(computed.constraint_residual[-1].max()) < 1e-4
@@ -377,7 +383,7 @@ def test_both_branches_pass_their_flat_position(branch, in_plane):
     np.testing.assert_allclose(state.q, [crank, coupler, rocker], atol=1e-12)
     ts = np.linspace(0.0, 1.0, 8)
     rates = state.v * 4.0 / state.v[0]
-    computed = motion(scene, (state.q, rates), ts, rtol=1e-10, atol=1e-10)
+    computed = motion(scene, (state.q, rates), ts, stepsize=Steps(rtol=1e-10, atol=1e-10))
     first, last = np.asarray(computed.q[:, 0]), np.asarray(computed.q[:, 2])
     # The flat positions: pi, and zero.
     passed = first - np.pi if branch == "parallelogram" else first

@@ -193,8 +193,7 @@ def test_contacts_that_hold_do_not_slip_where_another_one_stops():
         v0,
         [0.0, 0.57],
         control=jax.tree_util.Partial(control),
-        rtol=drops.TOLERANCE,
-        atol=drops.TOLERANCE,
+        stepsize=jd.Steps(rtol=drops.TOLERANCE, atol=drops.TOLERANCE),
         events=[jd.events.ModeSwitches(1200)],
     )
     times, names = np.asarray(motion.events.time), motion.events.name

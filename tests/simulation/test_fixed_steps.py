@@ -108,7 +108,9 @@ def test_reduced_and_projected_steps_are_watched():
     for method in ("projected", "reduced"):
 
         def run(h, method=method):
-            solution = jd.simulate(scene, q, v, [0.0, 1.2], method=method, stepsize=h, throw=False, max_steps=256)
+            solution = jd.simulate(
+                scene, q, v, [0.0, 1.2], method=method, stepsize=jd.Steps(h, max_steps=256), throw=False
+            )
             return solution.result
 
         fine, _ = codes(quick(jax.vmap(run))(jnp.asarray([0.01, 0.6])))

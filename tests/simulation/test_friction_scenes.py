@@ -11,7 +11,7 @@ import jaxdyn as jd
 from jaxdyn import scenes
 
 G, MASSES, MOMENTS = 9.81, (1.0, 0.6), (0.5, 0.2)
-TIGHT = {"rtol": 1e-11, "atol": 1e-11}
+TIGHT = {"stepsize": jd.Steps(rtol=1e-11, atol=1e-11)}
 TS = jnp.linspace(0.0, 2.0, 21)
 
 
@@ -160,7 +160,9 @@ def moreau(T, dt, q, u):
 def test_woodpecker_comes_back_to_its_published_state():
     """One period from the published numbers: the same angles and velocities to 1 %, and what Moreau's time stepping gives."""
     q, v = scenes.woodpecker.start()
-    motion = jd.simulate(scenes.woodpecker(), q, v, jnp.linspace(0.0, 0.1459, 3), rtol=1e-10, atol=1e-12)
+    motion = jd.simulate(
+        scenes.woodpecker(), q, v, jnp.linspace(0.0, 0.1459, 3), stepsize=jd.Steps(rtol=1e-10, atol=1e-12)
+    )
     names = [name.split(": ") for name in motion.events.name[: int(motion.events.count)]]
     # The sleeve jams below, comes free, hits above, and the beak hits; then it jams below again.
     order = [name for name in names if name[1] in ("touch", "stick")]
@@ -184,7 +186,9 @@ def test_woodpecker_has_a_periodic_motion_beside_the_published_numbers():
     """
     period, rates = 0.14597606587, (-0.33947852, -7.46209503)
     q, v = scenes.woodpecker.start(velocity=(rates[0], 0.0, rates[1]))
-    motion = jd.simulate(scenes.woodpecker(), q, v, jnp.asarray([0.0, period, 2 * period]), rtol=1e-10, atol=1e-12)
+    motion = jd.simulate(
+        scenes.woodpecker(), q, v, jnp.asarray([0.0, period, 2 * period]), stepsize=jd.Steps(rtol=1e-10, atol=1e-12)
+    )
     for row in (1, 2):
         np.testing.assert_allclose(motion.q[row, 1:], q[1:], atol=1e-6)
         np.testing.assert_allclose(motion.v[row], v, atol=1e-5 * 7.5)
@@ -193,7 +197,7 @@ def test_woodpecker_has_a_periodic_motion_beside_the_published_numbers():
     hits = times[[k for k, name in enumerate(motion.events.name) if name.endswith("touch")]]
     assert len(hits) >= 8 and np.diff(hits).min() > 1e-4  # one contact at a time
     changed = scenes.woodpecker(friction=0.301)
-    twice = jd.simulate(changed, q, v, jnp.asarray([0.0, period]), rtol=1e-9, atol=1e-11)
+    twice = jd.simulate(changed, q, v, jnp.asarray([0.0, period]), stepsize=jd.Steps(rtol=1e-9, atol=1e-11))
     assert abs(float(twice.v[-1, 0]) / rates[0] - 1) > 0.01
 
 

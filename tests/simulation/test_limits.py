@@ -97,7 +97,12 @@ def fall(level, *others, **options):
     terminal = [*(jd.events.Terminal(one) for one in others), jd.events.Terminal(Below(jnp.asarray(level)))]
     ts = jnp.linspace(0.0, 1.0, 11)
     return jd.simulate(
-        builder.build(), q0, jnp.zeros(6), ts, events=terminal, **{"rtol": 1e-10, "atol": 1e-10} | options
+        builder.build(),
+        q0,
+        jnp.zeros(6),
+        ts,
+        events=terminal,
+        **{"stepsize": jd.Steps(rtol=1e-10, atol=1e-10)} | options,
     )
 
 
@@ -115,7 +120,7 @@ def test_a_terminal_event_ends_a_run_at_its_time():
     assert int(fall(1.9, lambda q, v, t: v[2] + 2.0).stats["terminal_event"]) == 1
 
 
-OTHER_STEPS = [{}, {"stepsize": 0.01, "rtol": None, "atol": None}, {"solver": jd.solvers.Rodas5P()}]
+OTHER_STEPS = [{}, {"stepsize": 0.01}, {"solver": jd.solvers.Rodas5P()}]
 
 
 @pytest.mark.parametrize("options", OTHER_STEPS, ids=["adaptive", "fixed", "stiff"])
@@ -149,12 +154,24 @@ def test_the_time_of_a_terminal_event_has_derivatives():
         fall(0.5, adjoint="backsolve")
 
 
-def test_former_arguments_warn_with_the_new_form(cart):
-    new = r"events=\[jd.events.JointLimit\(stop=True\)\]"
-    with pytest.warns(DeprecationWarning, match=new):
-        end = jd.simulate(cart, [0.0], [0.0], TS, control=push, limits="stop", throw=False)  # pyright: ignore[reportCallIssue]
-    wanted = jd.simulate(cart, [0.0], [0.0], TS, control=push, events=[jd.events.JointLimit()], throw=False)
+@pytest.mark.parametrize(
+    ("former", "present", "text"),
+    [
+        ({"limits": "stop"}, {"events": [jd.events.JointLimit()]}, r"events=\[jd.events.JointLimit\(stop=True\)\]"),
+        ({"rtol": 1e-4}, {"stepsize": jd.Steps(rtol=1e-4)}, r"stepsize=jd.Steps\(rtol="),
+        ({"stepsize": 0.1, "max_steps": 3}, {"stepsize": jd.Steps(0.1, max_steps=3)}, r"Steps\(stepsize, max_steps="),
+        ({"outputs": ("pose:cart",)}, {"outputs": (jd.simulation.Pose("cart"),)}, r"outputs=\(jd.simulation.Pose"),
+    ],
+)
+def test_former_arguments_warn_with_the_new_form(cart, former, present, text):
+    def run(**options):
+        return jd.simulate(cart, [0.0], [0.0], TS, control=push, throw=False, **options)
+
+    with pytest.warns(DeprecationWarning, match=text):
+        end = run(**former)
+    wanted = run(**present)
     np.testing.assert_array_equal(end.q, wanted.q)
+    assert end.poses.keys() == wanted.poses.keys() and end.result == wanted.result
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.simulation.hybrid import transitions
-from jaxdyn.simulation.hybrid.modes import Mode, elements_of
-from jaxdyn.simulation.hybrid.rows import Gram
+from jaxdyn.simulation.hybrid.modes import Gram, Mode, elements_of
 
 CONTACTS, SIZE = 3, 9
 

@@ -19,7 +19,8 @@ from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import integrate, neutral
-from jaxdyn.simulation import integration
+from jaxdyn.simulation import Pose, integration
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.solvers import RK4, ExplicitSteps, LieGroup, ProjectedSolver
@@ -150,8 +151,9 @@ def test_order_of_convergence_with_retraction(solver, order, steps):
     @jax.vmap
     def run(h):
         # Of the implicit method's inner iteration.
-        tolerances = {"rtol": 1e-13, "atol": 1e-13} if isinstance(solver, diffrax.Kvaerno5) else {}
-        out = simulate(bodies, q0, v0, [0.0, 2.0], solver=solver, stepsize=h, max_steps=1024, **tolerances)
+        tolerance = 1e-13 if isinstance(solver, diffrax.Kvaerno5) else None
+        steps = Steps(h, rtol=tolerance, atol=tolerance, max_steps=1024)
+        out = simulate(bodies, q0, v0, [0.0, 2.0], solver=solver, stepsize=steps)
         return out.q[-1], out.v[-1], out.success, out.stats["num_steps"]
 
     q, v, success, count = (np.asarray(x) for x in run(jnp.asarray(steps)))
@@ -196,7 +198,7 @@ def test_panda_against_pinocchio_and_scipy():
     reference = solve_ivp(rate, (0, 1), x0, "DOP853", ts, rtol=1e-12, atol=1e-12).y.T
     scene = Scene(model, forces=(JointDamping(2.0),))
     control = Feedback(jnp.asarray(0.4), jnp.asarray(push))
-    solution = simulate(scene, q0, v0, ts, control=control, rtol=1e-12, atol=1e-12)
+    solution = simulate(scene, q0, v0, ts, control=control, stepsize=Steps(rtol=1e-12, atol=1e-12))
     scale = np.abs(reference[:, robot.nq :]).max()
     np.testing.assert_allclose(solution.q, reference[:, : robot.nq], rtol=0, atol=1e-9)
     np.testing.assert_allclose(solution.v, reference[:, robot.nq :], rtol=0, atol=1e-9 * scale)
@@ -207,12 +209,20 @@ def driven(leg):
     """The leg with damping, friction, a spring and a control, with every output."""
     forces = (JointDamping(0.1), CoulombFriction(0.05, v_s=0.5), JointSpring(1.5))
     control = Feedback(jnp.asarray(0.05), jnp.asarray([0.3, -0.2, 0.1, 0.4]))
-    outputs = ("energy", "work", "power", "acceleration", "pose:foot")
+    outputs = ("energy", "work", "power", "acceleration", Pose("foot"))
     scene = Scene(leg, forces=forces)
     return (
         scene,
         control,
-        simulate(scene, Q0, V0, np.linspace(0, 2, 401), control=control, rtol=1e-12, atol=1e-12, outputs=outputs),
+        simulate(
+            scene,
+            Q0,
+            V0,
+            np.linspace(0, 2, 401),
+            control=control,
+            stepsize=Steps(rtol=1e-12, atol=1e-12),
+            outputs=outputs,
+        ),
     )
 
 
@@ -258,7 +268,7 @@ def test_stiff_friction_with_an_implicit_method():
     scene = Scene(builder.build(), forces=(CoulombFriction(1.0, v_s=1e-5),))
     # It slides from 1 m/s at -0.5 m/s^2 and is at rest, all but v_s, at 2 s.
     ts = np.array([0.0, 0.5, 1.0, 1.9, 2.5, 4.0])
-    solution = simulate(scene, [0.0], [1.0], ts, solver=diffrax.Kvaerno5(), rtol=1e-8, atol=1e-10)
+    solution = simulate(scene, [0.0], [1.0], ts, solver=diffrax.Kvaerno5(), stepsize=Steps(rtol=1e-8, atol=1e-10))
     at_rest = ts > 2
     np.testing.assert_allclose(solution.v[~at_rest, 0], 1 - 0.5 * ts[~at_rest], rtol=0, atol=1e-7)
     np.testing.assert_allclose(solution.v[at_rest, 0], 0, atol=1e-8)
@@ -299,7 +309,7 @@ def test_reverse_mode_against_finite_differences(leg):
     """Masses, start, coefficients and control, with adaptive steps; and finite at rest, where error estimates vanish."""
 
     def function(z, q0):
-        return leg_end(leg, z, q0, rtol=1e-13, atol=1e-13)
+        return leg_end(leg, z, q0, stepsize=Steps(rtol=1e-13, atol=1e-13))
 
     q0 = jnp.asarray(Q0)
     slope = central_difference(quick(jax.vmap(lambda z: function(z, q0))), POINT)
@@ -328,7 +338,7 @@ def test_modes_and_second_order(pendulum):
     rest = np.array([1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
     def direct(z):
-        return swing(pendulum, z, adjoint="direct", stepsize=0.05, max_steps=16)
+        return swing(pendulum, z, adjoint="direct", stepsize=Steps(0.05, max_steps=16))
 
     def gradient_twice(z):
         gradient = jax.grad(direct)(z)
@@ -354,7 +364,7 @@ def test_modes_and_second_order(pendulum):
 def test_continuous_adjoint(pendulum):
     """Its gradients are those of the exact motion, to the tolerance of the solution."""
     z = jnp.asarray([1.2, 0.7, -0.5, 0.1, 0.05, 0.3])
-    tight = {"rtol": 1e-10, "atol": 1e-10}
+    tight = {"stepsize": Steps(rtol=1e-10, atol=1e-10)}
     gradient = quick(jax.grad(lambda z: swing(pendulum, z, adjoint="backsolve", **tight)))(z)
     expected = quick(jax.grad(lambda z: swing(pendulum, z, **tight)))(z)
     np.testing.assert_allclose(gradient, expected, rtol=1e-7)
@@ -398,9 +408,7 @@ def test_float32(pendulum):
 # Compilation, failures, refusals
 
 
-@pytest.mark.parametrize(
-    ("name", "usual", "other", "array"), [("stepsize", 0.02, 0.0203, 0.02), ("rtol", 1e-8, 1e-7, 1)]
-)
+@pytest.mark.parametrize(("name", "usual", "other", "array"), [("size", 0.02, 0.0203, 0.02), ("rtol", 1e-8, 1e-7, 1)])
 def test_other_numbers_do_not_compile_anew(pendulum, name, usual, other, array):
     """The control is traced once, whatever the masses, coefficients, states, times, steps and tolerances."""
     traces = []
@@ -412,7 +420,7 @@ def test_other_numbers_do_not_compile_anew(pendulum, name, usual, other, array):
     def run(mass, coefficient, q0, end, number):
         model = pendulum.replace(inertias=pendulum.inertias * mass)
         scene = Scene(model, forces=(JointDamping(coefficient),))
-        return simulate(scene, q0, [0.1], [0.0, 0.5, end], control=control, **{name: number}).q[-1, 0]
+        return simulate(scene, q0, [0.1], [0.0, 0.5, end], control=control, stepsize=Steps(**{name: number})).q[-1, 0]
 
     numbers = (1.0, 0.1, [0.2], 1.0, usual)
     first = run(*numbers)
@@ -452,8 +460,8 @@ def test_failures_are_codes_or_errors(pendulum):
     with pytest.raises(
         RuntimeError, match=r"stopped at t = .* of 4 s.*maximum number of solver steps.*max_steps \(now 9\)"
     ):
-        simulate(pendulum, [1.0], [0.0], ts, max_steps=9)
-    short = simulate(pendulum, [1.0], [0.0], ts, max_steps=9, throw=False)
+        simulate(pendulum, [1.0], [0.0], ts, stepsize=Steps(max_steps=9))
+    short = simulate(pendulum, [1.0], [0.0], ts, stepsize=Steps(max_steps=9), throw=False)
     assert short.result == RESULTS.max_steps_reached and not short.success
     reached = float(short.stats["time_reached"])
     np.testing.assert_array_equal(np.isnan(short.q[:, 0]), np.asarray(ts) > reached)
@@ -484,7 +492,7 @@ def test_a_derivative_that_is_nan_from_the_start_ends_soon(pendulum):
 
 
 def test_throw_inside_jit(pendulum):
-    run = jax.jit(lambda q: simulate(pendulum, q, [0.0], [0.0, 4.0], max_steps=5, throw=True).q)
+    run = jax.jit(lambda q: simulate(pendulum, q, [0.0], [0.0, 4.0], stepsize=Steps(max_steps=5), throw=True).q)
     with pytest.raises(Exception, match="maximum number of solver steps"):
         jax.block_until_ready(run(jnp.ones(1)))
 
@@ -531,8 +539,8 @@ def nothing(q, v, t):
         ({"adjoint": "adjoint"}, "adjoint is 'adjoint'; choose one of reverse, direct, forward, backsolve"),
         ({"outputs": ("energy", "heat")}, "outputs has 'heat'; choose from energy, power"),
         ({"outputs": "energy"}, "outputs is the string 'energy'; pass a tuple"),
-        ({"outputs": ("pose:fot",)}, "frame 'fot' is not in model 'leg'; did you mean foot"),
-        ({"max_steps": 0}, "max_steps is 0; pass a positive integer"),
+        ({"outputs": (Pose("fot"),)}, "frame 'fot' is not in model 'leg'; did you mean foot"),
+        ({"stepsize": Steps(max_steps=0)}, "max_steps is 0; pass a positive integer"),
         ({"scene": 3}, "system is a int, which has no nq and nv"),
     ],
 )

@@ -11,9 +11,9 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from benchmarks.extremes import name_of
 from benchmarks.stiff import SOLVERS, cases, program, reference, runner
+from jaxdyn.compile import inverse, kernel
 from jaxdyn.model.configuration import map_joints
-from jaxdyn.simulation.solvers.lie import _local_rate
-from jaxdyn.simulation.solvers.rosenbrock import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P
+from jaxdyn.simulation.solvers.diffrax_methods import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P, _local_rate
 
 
 def slider(mass=1.0):
@@ -40,7 +40,7 @@ def test_first_step_is_the_same_in_any_unit_of_time():
         scene = jd.Scene(model, forces=(jd.forces.JointSpring(w * w),))
         start = jnp.ones(1), 0.5 * w[None]
         # Without atol, which is not the same for m/s in all units of time; powers of two make the numbers the same.
-        return jd.simulate(scene, *start, jnp.stack([0 * w, 10 / w]), atol=1e-30, throw=False)
+        return jd.simulate(scene, *start, jnp.stack([0 * w, 10 / w]), stepsize=jd.Steps(atol=1e-30), throw=False)
 
     computed = run(2.0 ** np.array([0, 20, -20]))
     assert computed.success.all()
@@ -354,7 +354,7 @@ def test_default_solver_and_advice_follow_stiffness():
 
     def run(stiffness, **options):
         scene, control, q0, v0 = case.build(jnp.asarray(stiffness))
-        return jd.simulate(scene, q0, v0, case.ts, control=control, max_steps=400, **options)
+        return jd.simulate(scene, q0, v0, case.ts, control=control, stepsize=jd.Steps(max_steps=400), **options)
 
     for stiffness, solver in ((1e3, "Dopri8"), (1e9, "Rodas5P")):
         computed = run(stiffness)
@@ -404,7 +404,7 @@ def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
 
     def end(log, adjoint=None):
         scene = jd.Scene(model, forces=(jd.forces.JointSpring(jnp.exp(log)), jd.forces.JointDamping(0.01)))
-        options = {"solver": solver, "adjoint": adjoint, "max_steps": 1024, "throw": False}
+        options = {"solver": solver, "adjoint": adjoint, "stepsize": jd.Steps(max_steps=1024), "throw": False}
         solution = jd.simulate(scene, jnp.asarray([2.5]), jnp.asarray([0.1]), ts, **options)
         return jnp.sum(solution.q * solution.v), solution.stats["num_steps"]
 
@@ -478,3 +478,43 @@ def test_rodas_serves_at_every_stiffness():
     assert success.all() and steps.max() < 300
     np.testing.assert_allclose(q, ends[0], rtol=0, atol=1e-6 * case.size)
     np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-5 * case.size)
+
+
+@pytest.mark.long
+def test_stiff_scenes_with_dry_friction():
+    """A block dragged over the ground by a stiff spring, until it stops: events, ends and gradients are those of Dopri8."""
+    builder = jd.ModelBuilder("dragged", gravity=None)
+    for name, mass in (("block", 1.0), ("hook", 0.1)):
+        builder.add_body(name, joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0.1, 0.1, 0.1)))
+    model, ts = builder.build(), jnp.linspace(0.0, 0.6, 4)
+
+    def end(speed, solver, stiffness):
+        def spring(system, q, v, t):
+            pull = stiffness * (q[1] - q[0]) + 0.02 * stiffness * (v[1] - v[0])
+            return jnp.stack([pull, -pull])
+
+        scene = jd.Scene(model, forces=[spring, jd.contact.DryFriction(0.4, 9.81, 0)])
+        motion = jd.simulate(
+            scene, jnp.zeros(2), jnp.stack([speed, speed]), ts, solver=solver, stepsize=jd.Steps(rtol=1e-9, atol=1e-9)
+        )
+        return motion.q[-1, 0], (motion.stats["num_steps"], motion.v[-1])
+
+    slope, (_, v) = jax.grad(end, has_aux=True)(1.0, jd.solvers.Rodas5P(), 3e3)
+    by_dopri8 = [end(1.0 + d, diffrax.Dopri8(), 3e3)[0] for d in (-1e-3, 0.0, 1e-3)]
+    np.testing.assert_allclose(v, 0, atol=1e-6)
+    np.testing.assert_allclose(end(1.0, jd.solvers.Rodas5P(), 3e3)[0], by_dopri8[1], rtol=1e-7)
+    np.testing.assert_allclose(slope, (by_dopri8[2] - by_dopri8[0]) / 2e-3, rtol=1e-4)
+    # A body with the mass of both would stop at m v^2 / (2 mu N), which the spring's stretch hardly changes.
+    np.testing.assert_allclose(by_dopri8[1], 1.1 / (2 * 0.4 * 9.81), rtol=2e-2)
+    assert end(1.0, jd.solvers.Rodas5P(), 1e7)[1][0] < 300
+
+
+@pytest.mark.native
+def test_inverses_within_kernels():
+    """By elimination without exchange of rows; samples whose pivots cancel are computed with exchanges."""
+    rng = np.random.default_rng(3)
+    matrices = rng.normal(size=(6, 5, 5)) + 4 * np.eye(5)
+    matrices[1, 0, 0] = 0.0
+    matrices[3, :2, :2] = 1.0
+    computed = jax.jit(jax.vmap(lambda x: kernel(lambda _, x: inverse(x), fallback=lambda _, x: inverse(x))(None, x)))
+    np.testing.assert_allclose(computed(matrices), np.linalg.inv(matrices), rtol=0, atol=1e-13)

@@ -13,7 +13,7 @@ from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, spatial_jacobian
-from jaxdyn.forces.dissipation import SlidingFriction
+from jaxdyn.forces.drives import SlidingFriction
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.geometry.immersion import constrain_by_immersion, reaction_force
 from jaxdyn.lie.so3 import hat

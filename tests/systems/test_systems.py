@@ -8,7 +8,7 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.forces.dissipation import RayleighDissipation, SlidingFriction
+from jaxdyn.forces.drives import RayleighDissipation, SlidingFriction
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.simulation.run import simulate

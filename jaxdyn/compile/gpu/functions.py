@@ -12,8 +12,8 @@ import math
 from collections.abc import Callable
 
 from jaxdyn.compile.gpu.numbers import Number, constant
-from jaxdyn.compile.llvm import Emitter
-from jaxdyn.compile.trigonometry import COSINE, SINE, pi_with_bits
+from jaxdyn.compile.llvm import COSINE, SINE, Emitter
+from jaxdyn.compile.operations import pi_with_bits
 
 # ln 2 in two parts: k times the first is exact for the exponents k of float64.
 LN2_HIGH, LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10

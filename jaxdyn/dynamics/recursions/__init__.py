@@ -3,11 +3,10 @@
 | module             | equations                                                                                    |
 |--------------------|----------------------------------------------------------------------------------------------|
 | `frames`           | canonical link frames (joint axis on z, Denavit-Hartenberg) and masses transferred between bodies    |
-| `transforms`       | changes of frame of twists, wrenches and inertias                                            |
+| `transforms`       | changes of frame of twists, wrenches and inertias; products by numpy or by the traced program |
 | `links`            | joint transforms and motion subspaces of every joint kind                                    |
-| `newton_euler`     | recursive Newton-Euler: inverse dynamics, bias and gravity force; composite bodies: the mass matrix |
+| `newton_euler`     | recursive Newton-Euler, composite bodies, articulated-body inertias: M = W W^T, and M^-1 times a vector |
 | `sweeps`           | the same for many bodies, as loops whose code does not grow with their number                 |
-| `articulated`      | articulated-body inertias: M = W W^T, and M^-1 times a vector; forward dynamics and its tangent |
 
 EQUATIONS sections 4 and 5; Featherstone (2008), chapters 5 to 7. Twists are (v, omega) and wrenches (f, n), linear part first.
 
@@ -19,10 +18,10 @@ This package imports `jaxdyn.compile`, the Lie groups and `jaxdyn.model.tree`. I
 `jaxdyn.dynamics.world_frame` and `jaxdyn.dynamics.scans`, and imports neither.
 """
 
-from jaxdyn.dynamics.recursions.articulated import aba as aba
-from jaxdyn.dynamics.recursions.articulated import aba_tangent as aba_tangent
-from jaxdyn.dynamics.recursions.articulated import mass_matrix_sqrt as mass_matrix_sqrt
+from jaxdyn.dynamics.recursions.newton_euler import aba as aba
+from jaxdyn.dynamics.recursions.newton_euler import acceleration_and_inverse as acceleration_and_inverse
 from jaxdyn.dynamics.recursions.newton_euler import bias_force as bias_force
 from jaxdyn.dynamics.recursions.newton_euler import crba as crba
 from jaxdyn.dynamics.recursions.newton_euler import gravity_force as gravity_force
+from jaxdyn.dynamics.recursions.newton_euler import mass_matrix_sqrt as mass_matrix_sqrt
 from jaxdyn.dynamics.recursions.newton_euler import rnea as rnea

@@ -1,7 +1,7 @@
 """Joint transforms and motion subspaces of every joint kind, in canonical link frames (see `frames`).
 
 Inside the recursions the velocity of a one-degree-of-freedom joint is that of a unit screw, rad/s or m/s; `unit_velocity` and
-`from_unit_force` convert where a model's screws have another norm.
+`unit_force` convert where a model's screws have another norm.
 """
 
 from typing import Any, NamedTuple
@@ -11,17 +11,6 @@ import numpy as np
 from jax import lax
 
 from jaxdyn.compile.known import as_numpy_if_known
-from jaxdyn.dynamics.recursions._arrays import (
-    constants,
-    contract,
-    dot,
-    dot_transpose,
-    entry,
-    join,
-    outer,
-    part,
-    transpose,
-)
 from jaxdyn.dynamics.recursions.frames import Frames, PlaneAngle, canonical_frames, pseudo_inertias
 from jaxdyn.dynamics.recursions.transforms import (
     Chain,
@@ -31,7 +20,13 @@ from jaxdyn.dynamics.recursions.transforms import (
     Transform,
     X,
     Z,
-    wrench_to_parent,
+    constants,
+    contract,
+    dot,
+    entry,
+    join,
+    outer,
+    part,
 )
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model
@@ -75,20 +70,14 @@ def links_of(model: Model) -> Links:
     return Links(model, frames, inertias, subspaces, as_numpy_if_known(model.gravity), armature, scale)
 
 
-def unit_velocity(links: Links, v):
-    """Scale velocities or accelerations (nv,) to unit screws; equally, forces of unit screws to the model's."""
-    return v if links.scale is None else v * links.scale
+def unit_velocity(of, v) -> Any:
+    """Velocities (nv,), or None, of unit screws, `of` links or bodies with a `scale`; equally, forces of the model's screws."""
+    return v if of.scale is None or v is None else v * of.scale
 
 
-from_unit_force = unit_velocity
-
-
-def unit_force(links: Links, tau):
-    """Scale generalised forces (nv,) to unit screws; equally, velocities of unit screws to the model's."""
-    return tau if links.scale is None else tau / links.scale
-
-
-from_unit_velocity = unit_force
+def unit_force(of, tau) -> Any:
+    """The inverse: generalised forces (nv,) on unit screws; equally, velocities of the model's screws."""
+    return tau if of.scale is None else tau / of.scale
 
 
 def by_joint(links: Links, values) -> list:
@@ -225,14 +214,6 @@ def _simplify(steps) -> Chain:
             chain.append(Transform(shift, step.rotation))
             shift = None
     return (*chain, Transform(shift, None)) if shift is not None else tuple(chain)
-
-
-def wrench_in_link(links: Links, body: int, F):
-    """Convert a wrench (6,) from a body's frame to its canonical frame."""
-    B = entry(links.frames.placement, body)
-    rotation, place = part(part(B, 0, 3), 0, 3, 1), entry(part(B, 0, 3), 3, 1)
-    # From the body frame's origin to the canonical one: rotate the wrench, then shift it.
-    return wrench_to_parent((Transform(-dot_transpose(rotation, place), GeneralRotation(transpose(rotation))),), F)
 
 
 def as_vector(parts, like):

@@ -1,4 +1,4 @@
-"""Inverse dynamics by the recursive Newton-Euler algorithm, and the mass matrix by composite rigid bodies.
+"""Recursive Newton-Euler, composite rigid bodies, articulated bodies: inverse dynamics, mass matrix, forward dynamics.
 
 Every point r of a body (in its frame) has the acceleration a + K r, where a is that of the frame's origin and
 
@@ -10,38 +10,41 @@ inertial forces: its last column is the inertial force, and vee(Y - Y^T) the mom
 Source: Luh, Walker & Paul (1980); K as in Balafoutis, Patel & Misra (1988); EQUATIONS section 4.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.recursions._arrays import (
+from jaxdyn.dynamics.recursions.links import (
+    Links,
+    as_vector,
+    by_joint,
+    columns_of,
+    joint_transforms,
+    links_of,
+    unit_force,
+    unit_velocity,
+)
+from jaxdyn.dynamics.recursions.transforms import (
+    Chain,
     constants,
     contract,
     dot,
     dot_transpose,
     entry,
+    inertia_to_parent,
     join,
-    part,
-    select,
-    transpose,
-)
-from jaxdyn.dynamics.recursions.links import (
-    Links,
-    as_vector,
-    by_joint,
-    from_unit_force,
-    joint_transforms,
-    links_of,
-    unit_velocity,
-    wrench_in_link,
-)
-from jaxdyn.dynamics.recursions.transforms import (
-    Chain,
     moments_to_parent,
     origin_in_parent,
+    outer,
+    part,
     rotate_to_child,
+    select,
+    symmetric,
+    transpose,
+    twist_to_child,
     wrench_to_parent,
 )
 from jaxdyn.model.arguments import check_shapes
@@ -59,11 +62,10 @@ def _hat(w):
     return dot(constants(w.dtype).hat, w)
 
 
-def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=None) -> list:
+def body_wrenches(links: Links, chains: list[Chain], v=None, a=None) -> list:
     """Inertial wrenches (6,) of all bodies, gravity included: the outward pass.
 
-    **Arguments:** `chains` from `joint_transforms`; `v`, `a` (nv,) of unit screws, None for zero; `external` (nb, 6), wrenches
-    that act on the bodies in the model's body frames, or None.
+    **Arguments:** `chains` from `joint_transforms`; `v`, `a` (nv,) of unit screws, None for zero.
     """
     dtype = links.frames.home.dtype
     zero = np.zeros(3, dtype)
@@ -79,10 +81,7 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
             move_with_joint(motion[parent] if parent >= 0 else at_rest, chains[i], links.subspaces[i], speed, rate)
         )
         _, _, K, acc = motion[-1]
-        wrench = wrench_of_acceleration(K, acc, links.moments[i])
-        if external is not None:
-            wrench = wrench - wrench_in_link(links, i, entry(external, i))
-        wrenches.append(wrench)
+        wrenches.append(wrench_of_acceleration(K, acc, links.moments[i]))
     return wrenches
 
 
@@ -122,50 +121,33 @@ def _is_nonzero(S) -> bool:
     return not isinstance(S, np.ndarray) or bool(S.any())
 
 
-def joint_forces(links: Links, chains: list[Chain], wrenches: list) -> list:
-    """Inward pass: generalised forces (nj,) of each joint, S^T times the wrenches of all bodies that the joint carries."""
-    total: list = list(wrenches)
-    tau: list = [None] * len(wrenches)
-    for i in reversed(range(len(wrenches))):
-        tau[i] = dot_transpose(links.subspaces[i], total[i])
+def _inverse(model: Model, q, v=None, a=None):
+    links = links_of(model)
+    v, a = (unit_velocity(links, x) for x in (v, a))
+    chains = joint_transforms(links, q)
+    total: list = body_wrenches(links, chains, v, a)
+    forces: list = [None] * model.nb
+    # Inward: S^T times the wrenches of all bodies that a joint carries.
+    for i in reversed(range(model.nb)):
+        forces[i] = dot_transpose(links.subspaces[i], total[i])
         if links.parents[i] >= 0:
             total[links.parents[i]] = total[links.parents[i]] + wrench_to_parent(chains[i], total[i])
-    return tau
-
-
-def _inverse(model: Model, q, v=None, a=None, external=None):
-    links = links_of(model)
-    v, a = (None if x is None else unit_velocity(links, x) for x in (v, a))
-    chains = joint_transforms(links, q)
-    tau = as_vector(joint_forces(links, chains, body_wrenches(links, chains, v, a, external)), q)
+    tau = as_vector(forces, q)
     if a is not None and links.armature is not None:
         # Rotors turn with the joint's own rate and belong to no body, so they bypass the recursion.
         tau = tau + links.armature * a
-    return from_unit_force(links, tau)
+    return unit_velocity(links, tau)
 
 
 def rnea(
-    model: Model,
-    q: Float[Array, " nq"],
-    v: Float[Array, " nv"],
-    a: Float[Array, " nv"] | None,
-    *,
-    external: Float[Array, "nb 6"] | None = None,
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"] | None
 ) -> Float[Array, " nv"]:
-    r"""Inverse dynamics by the recursive Newton-Euler algorithm.
-
-    $$\tau = M a + C v + N - \sum_i J_i^T F_i$$
-
-    **Arguments:** `q` (nq,); `v`, `a` (nv,) joint velocities and accelerations (rad/s or m/s, rad/s^2 or m/s^2); `a` None is
-    zero acceleration, whose terms are left out. `external` (nb, 6): wrenches $F_i$ that act on the bodies, at their origins
-    in their axes (N, N m), or None.
-
-    **Returns:** generalised forces (nv,), N m or N. Armature included.
+    """Inverse dynamics M a + C v + N (nv,), N m or N, armature included; `a` None is zero, whose terms are left out.
 
     Source: EQUATIONS section 4; Luh, Walker & Paul (1980); Featherstone (2008) table 5.1.
     """
-    check_shapes(model, q=q, v=v, a=a, external=external)
-    return _inverse(model, q, v, a, external)
+    check_shapes(model, q=q, v=v, a=a)
+    return _inverse(model, q, v, a)
 
 
 def bias_force(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nv"]:
@@ -178,15 +160,6 @@ def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
     """Gravity force N = +dV/dq (nv,), N m or N: `rnea` at rest."""
     check_shapes(model, q=q)
     return _inverse(model, q)
-
-
-def momentum_columns(moments, S):
-    """Wrenches I S (6, nj) of unit joint accelerations of a composite body with the given moments (4, 4)."""
-    table = constants(moments.dtype)
-    # Y = [hat(w) v] J for each column (v, w) of S, as in `rnea`.
-    rates = join([contract(table.hat, part(S, 3, 6), (2,), (0,)), part(S, 0, 3).reshape(3, 1, -1)], 1)
-    Y = contract(rates, moments, (1,), (0,))  # (3, nj, 4)
-    return contract(table.moment, Y, (1, 2), (0, 2))
 
 
 def ancestor_rows(links: Links, chains: list[Chain], i: int, columns) -> list:
@@ -223,7 +196,10 @@ def crba(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
     total = list(links.moments)
     columns: list = [None] * model.nb
     for i in reversed(range(model.nb)):
-        force = momentum_columns(total[i], links.subspaces[i])
+        # Wrenches I S (6, nj) of unit accelerations of the composite body: Y = [hat(w) v] J for columns (v, w) of S.
+        table, S = constants(total[i].dtype), links.subspaces[i]
+        rates = join([contract(table.hat, part(S, 3, 6), (2,), (0,)), part(S, 0, 3).reshape(3, 1, -1)], 1)
+        force = contract(table.moment, contract(rates, total[i], (1,), (0,)), (1, 2), (0, 2))
         own = dot_transpose(links.subspaces[i], force)
         pieces = dict([(i, own), *ancestor_rows(links, chains, i, force)])
         columns[i] = place_rows(links, pieces, own.shape[1], q.dtype)
@@ -238,3 +214,186 @@ def crba(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
         M = M + links.armature[:, None] * np.eye(model.nv, dtype=q.dtype)
     # An M that does not depend on q is a numpy array up to here.
     return jnp.asarray(M if links.scale is None else links.scale[:, None] * M * links.scale[None, :])
+
+
+# Articulated-body inertias: the factorisation M = W W^T over the tree, and forward dynamics M^-1 f by two sweeps.
+#
+# Body i and its descendants, with free joints, respond to an acceleration of its frame like one body of the
+# articulated inertia A. To pass a joint with the motion subspace s, one degree of freedom is eliminated,
+#
+#     U = A s,   D = s^T U + armature,   A <- A - U U^T / D,
+#
+# those of a joint with several one after the other. The gains U/D and pivots D are all that the sweeps need.
+#
+# Source: EQUATIONS section 5; Featherstone (2008) section 7.3; Rodriguez, Jain & Kreutz-Delgado (1992).
+
+
+class ArticulatedFactors(NamedTuple):
+    """Factorisation of M: per body and degree of freedom, in the order of elimination, the gain U/D (6,) and 1/D."""
+
+    links: Links
+    chains: list[Chain]
+    gains: list[list]
+    inverses: list[list]
+
+
+def spatial_inertia(moments):
+    """Spatial inertia (6, 6) of a pseudo-inertia (4, 4): [[m, -hat(h)], [hat(h), tr(S) 1 - S]] with second moments S."""
+    # Twist a gives the point r the velocity E_a (r, 1) with E = `moment`, so I_ab = sum of m E_a (r, 1) . E_b (r, 1).
+    field = constants(moments.dtype).moment
+    tensor = np.einsum("aik,bil->abkl", field, field)
+    return contract(tensor, moments, (2, 3), (0, 1))
+
+
+def factorize(links: Links, chains: list[Chain]) -> ArticulatedFactors:
+    """Articulated-body factors of M: gains and pivots of every degree of freedom, from the leaves to the root."""
+    nb = links.model.nb
+    total = [spatial_inertia(moments) for moments in links.moments]
+    armatures = None if links.armature is None else by_joint(links, links.armature)
+    gains: list = [None] * nb
+    inverses: list = [None] * nb
+    for i in reversed(range(nb)):
+        A, gains[i], inverses[i] = total[i], [], []
+        for j, k in enumerate(columns_of(links.model.topology.kinds[i])):
+            armature = None if armatures is None else entry(armatures[i], j)
+            A, gain, inverse = eliminate(A, entry(links.subspaces[i], j, 1), k, armature)
+            gains[i].append(gain)
+            inverses[i].append(inverse)
+        parent = links.parents[i]
+        if parent >= 0:
+            total[parent] = total[parent] + inertia_to_parent(chains[i], A)
+    return ArticulatedFactors(links, chains, gains, inverses)
+
+
+def eliminate(A, s, k, armature):
+    """Eliminate one degree of freedom: A - U U^T/D, U/D and 1/D; `k` is the coordinate that s spans alone, or None."""
+    U = dot(A, s)
+    D = dot(s, U) if armature is None else dot(s, U) + armature
+    # Pivots of a positive definite M are positive; NaN marks any other M.
+    inverse = 1 / jnp.where(D > 0, D, jnp.full_like(D, jnp.nan))
+    gain = U * inverse
+    rest = A - outer(U, gain)
+    if armature is None and k is not None:
+        # Exact zeros and ones along that coordinate, which rounding would leave as 1e-17 and scalar programs could not drop.
+        along = np.eye(6, dtype=A.dtype)[k]
+        gain = select(along > 0, along, gain)
+        cross = np.maximum.outer(along, along) > 0
+        rest = select(cross, np.zeros((6, 6), A.dtype), rest)
+    return symmetric(rest), gain, inverse
+
+
+def inward(factors: ArticulatedFactors, force: list, wrenches: list | None = None) -> list[list]:
+    """Residual joint forces D^(1/2) W^-1 tau, less the wrenches on the bodies that each joint carries.
+
+    **Arguments:** `force`, per joint (nj,), on unit screws; `wrenches`, per body (6,), of its inertial motion, or None.
+
+    **Returns:** per joint, a list of numbers, one for each degree of freedom.
+    """
+    links = factors.links
+    bias: list = [None] * links.model.nb if wrenches is None else list(wrenches)
+    left: list = [None] * links.model.nb
+    for i in reversed(range(links.model.nb)):
+        F, left[i] = bias[i], []
+        for j, (k, gain) in enumerate(zip(columns_of(links.model.topology.kinds[i]), factors.gains[i], strict=True)):
+            tau = entry(force[i], j)
+            u = tau if F is None else tau - dot(entry(links.subspaces[i], j, 1), F)
+            left[i].append(u)
+            given = gain * u if F is None else F + gain * u
+            if k is not None and links.armature is None:  # along its axis the joint transmits exactly tau
+                along = np.eye(6, dtype=gain.dtype)[k]
+                given = select(along > 0, along * tau, given)
+            F = given
+        # No wrench yet means zero, for which nothing is computed.
+        parent = links.parents[i]
+        if parent >= 0:
+            up = wrench_to_parent(factors.chains[i], F)
+            bias[parent] = up if bias[parent] is None else bias[parent] + up
+    return left
+
+
+def outward(factors: ArticulatedFactors, left: list[list]) -> list:
+    """Accelerations (nj,) of the joints, on unit screws, from the residuals of `inward`."""
+    links = factors.links
+    twists: list = [None] * links.model.nb
+    out: list = []
+    for i, parent in enumerate(links.parents):
+        V = twist_to_child(factors.chains[i], twists[parent]) if parent >= 0 else None
+        joint_accelerations: list = [None] * len(left[i])
+        # In the reverse order of the elimination: back substitution within the joint.
+        for j in reversed(range(len(joint_accelerations))):
+            s, gain = entry(links.subspaces[i], j, 1), factors.gains[i][j]
+            free = left[i][j] * factors.inverses[i][j]
+            # The world does not accelerate, so a root has no twist to subtract.
+            if V is None:
+                joint_accelerations[j] = free
+                V = s * free
+                continue
+            x = joint_accelerations[j] = free - dot(gain, V)
+            V = V + s * x
+        out.append(joint_accelerations)
+        twists[i] = V
+    return out
+
+
+def solve(factors: ArticulatedFactors, force: Float[Array, " nv"], wrenches: list | None = None) -> Float[Array, " nv"]:
+    """Solve M a = force - (generalised forces of `wrenches` on the bodies), (nv,); `jax.vmap` for several columns."""
+    links = factors.links
+    left = inward(factors, by_joint(links, unit_force(links, force)), wrenches)
+    flat = [x for joint in outward(factors, left) for x in joint]
+    return unit_force(links, as_vector(flat, force))
+
+
+def aba(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    r"""Forward dynamics by the articulated-body algorithm.
+
+    $$a = M^{-1} (\tau - C v - N)$$
+
+    Velocity terms enter as the body wrenches of zero joint accelerations, computed outward, so that the inward and
+    outward sweeps are those of a plain $M^{-1}$.
+
+    **Arguments:** `q` (nq,); `v` (nv,) rad/s or m/s; `tau` (nv,) generalised forces, N m or N.
+
+    **Returns:** joint accelerations (nv,), rad/s^2 or m/s^2. NaN where M is not positive definite.
+
+    Source: EQUATIONS section 5 with $b_i$ started from the bias wrench; Featherstone (2008), section 7.3.
+    """
+    check_shapes(model, q=q, v=v, tau=tau)
+    return acceleration_and_inverse(model, q, v, tau)[0]
+
+
+def acceleration_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
+    """Forward dynamics a (nv,), and the function f -> M^-1 f, from one factorisation of M."""
+    links = links_of(model)
+    chains = joint_transforms(links, q)
+    wrenches = body_wrenches(links, chains, unit_velocity(links, v))
+    factors = factorize(links, chains)
+    return solve(factors, tau, wrenches), lambda force: solve(factors, force)
+
+
+def mass_matrix_sqrt(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
+    r"""Square root W (nv, nv) of the mass matrix from the articulated bodies; no Cholesky factorisation.
+
+    $$M = W W^T, \quad W = \xi^T G^T \hat M \xi D^{-1/2}, \quad \det M = \prod_k W_{kk}^2$$
+
+    Column k holds, for joint k and its ancestors, the force that $U_k / \sqrt{D_k}$ needs. Upper triangular for a chain
+    (within a joint of several degrees of freedom, lower triangular).
+
+    Source: EQUATIONS section 5; Rodriguez, Jain & Kreutz-Delgado (1992).
+    """
+    check_shapes(model, q=q)
+    links, columns = links_of(model), []
+    factors = factorize(links, joint_transforms(links, q))
+    for i in range(model.nb):
+        S = links.subspaces[i]
+        for j, (gain, inverse) in enumerate(zip(factors.gains[i], factors.inverses[i], strict=True)):
+            # det M is the product of the pivots D, so each diagonal entry of W is sqrt(D).
+            root = 1 / jnp.sqrt(inverse)
+            force = (gain * root).reshape(6, 1)
+            # Within a joint, elimination starts at column 0: later columns are zero in the rows of earlier ones.
+            own = [np.zeros((1, 1), q.dtype)] * j + [root.reshape(1, 1)]
+            own += [dot(entry(S, k, 1).reshape(1, 6), force) for k in range(j + 1, S.shape[1])]
+            pieces = dict([(i, join(own, 0)), *ancestor_rows(links, factors.chains, i, force)])
+            columns.append(place_rows(links, pieces, 1, q.dtype))
+    W: Any = join(columns, 1) if columns else jnp.zeros((0, 0), q.dtype)
+    # Joints are computed with unit screws; the scale restores forces of the screws as given.
+    return jnp.asarray(W if links.scale is None else links.scale[:, None] * W)

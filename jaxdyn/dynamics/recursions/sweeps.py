@@ -17,11 +17,9 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import sweep
 from jaxdyn.compile.known import as_numpy_if_known, is_concrete
-from jaxdyn.dynamics.recursions._arrays import contract, dot, join, part
-from jaxdyn.dynamics.recursions.articulated import eliminate, spatial_inertia
 from jaxdyn.dynamics.recursions.frames import MOMENTS, canonical_frames, pseudo_inertias
-from jaxdyn.dynamics.recursions.links import compose, quaternion_rotation
-from jaxdyn.dynamics.recursions.newton_euler import move_with_joint, wrench_of_acceleration
+from jaxdyn.dynamics.recursions.links import compose, quaternion_rotation, unit_force, unit_velocity
+from jaxdyn.dynamics.recursions.newton_euler import eliminate, move_with_joint, spatial_inertia, wrench_of_acceleration
 from jaxdyn.dynamics.recursions.transforms import (
     Chain,
     GeneralRotation,
@@ -30,7 +28,11 @@ from jaxdyn.dynamics.recursions.transforms import (
     Transform,
     X,
     Z,
+    contract,
+    dot,
     inertia_to_parent,
+    join,
+    part,
     twist_to_child,
     wrench_to_parent,
 )
@@ -201,21 +203,11 @@ def _bodies(model: Model) -> _Bodies:
     return (_Canonical if is_concrete(model.home, model.screws) else _Given)(model)
 
 
-def _to_unit_screws(bodies: _Bodies, x) -> Any:
-    """Velocities of unit screws from those of the model's; equally, forces of the model's screws from those of unit ones."""
-    return x if bodies.scale is None or x is None else x * bodies.scale
-
-
 def _to_unit_coordinates(bodies: _Bodies, q) -> Any:
     """Coordinates of unit screws; those of a floating base, a position and a quaternion, as they are."""
     if bodies.scale is None:
         return q
     return q * np.concatenate([np.ones(bodies.first, bodies.dtype), bodies.scale])
-
-
-def _to_model_units(bodies: _Bodies, x) -> Any:
-    """The inverse of `_to_unit_screws`."""
-    return x if bodies.scale is None else x / bodies.scale
 
 
 # --- a floating base ---
@@ -286,7 +278,7 @@ def _wrenches(bodies: _Bodies, q, v, a) -> tuple[Any, Any, Any]:
 def rnea(model: Model, q, v, a) -> Float[Array, " nv"]:
     """Inverse dynamics (see `newton_euler.rnea`); `v` and `a` may be None, which is zero."""
     bodies = _bodies(model)
-    q, v, a = _to_unit_coordinates(bodies, q), *(_to_unit_screws(bodies, x) for x in (v, a))
+    q, v, a = _to_unit_coordinates(bodies, q), *(unit_velocity(bodies, x) for x in (v, a))
     wrenches, places, own = _wrenches(bodies, q, v, a)
 
     def step(total, row):
@@ -299,7 +291,7 @@ def rnea(model: Model, q, v, a) -> Float[Array, " nv"]:
         tau = join([end + own, tau], 0)
     if a is not None and bodies.armature is not None:
         tau = tau + bodies.armature * a
-    return _to_unit_screws(bodies, tau)
+    return unit_velocity(bodies, tau)
 
 
 def bias_force(model: Model, q, v) -> Float[Array, " nv"]:
@@ -341,7 +333,7 @@ def _solve(factors: _Factors, force, wrenches=None, own=None) -> Float[Array, " 
     """Solve M a = force - (generalised forces of the wrenches, `own` that of a floating base)."""
     bodies, places, gains, inverses, of_base = factors
     zero = np.zeros(6, bodies.dtype)
-    ((base_force, force),) = _split(bodies, _to_model_units(bodies, force))
+    ((base_force, force),) = _split(bodies, unit_force(bodies, force))
 
     def inward(total, row):
         row, place, gain, force, wrench = row
@@ -362,22 +354,17 @@ def _solve(factors: _Factors, force, wrenches=None, own=None) -> Float[Array, " 
         gains_of_base, inverses_of_base = of_base
         start = _accelerate_base(gains_of_base, inverses_of_base, base_force, end if own is None else end + own)
     a = sweep(outward, bodies.parents, start, (bodies.rows, places, gains, inverses, left))[1]
-    return _to_model_units(bodies, a if of_base is None else join([start, a], 0))
+    return unit_force(bodies, a if of_base is None else join([start, a], 0))
 
 
-def _free_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
+def acceleration_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
+    """Forward dynamics a (nv,), and the function f -> M^-1 f, from one factorisation of M."""
     bodies = _bodies(model)
-    wrenches, places, own = _wrenches(bodies, _to_unit_coordinates(bodies, q), _to_unit_screws(bodies, v), None)
+    wrenches, places, own = _wrenches(bodies, _to_unit_coordinates(bodies, q), unit_velocity(bodies, v), None)
     factors = _factorize(bodies, places)
     return _solve(factors, tau, wrenches, own), lambda force: _solve(factors, force)
 
 
 def aba(model: Model, q, v, tau) -> Float[Array, " nv"]:
-    """Forward dynamics (see `articulated.aba`)."""
-    return _free_and_inverse(model, q, v, tau)[0]
-
-
-def aba_tangent(model: Model, q, v, tau, force_change: Callable) -> tuple[Array, Array]:
-    """Forward dynamics a, and M^-1 times `force_change(a)` (see `articulated.aba_tangent`)."""
-    a, times = _free_and_inverse(model, q, v, tau)
-    return a, times(force_change(a))
+    """Forward dynamics (see `newton_euler.aba`)."""
+    return acceleration_and_inverse(model, q, v, tau)[0]

@@ -9,7 +9,7 @@ Painleve's paradox, where forces of rigid bodies do not exist or are not unique.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,19 @@ from jaxtyping import Array
 from jaxdyn.compile import eliminate
 from jaxdyn.dynamics.quantities import bias_force
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.modes import Elements, Mode, force_at
-from jaxdyn.simulation.hybrid.rows import Gram, StateTerms, by_element, by_normal_row, force_tolerance, gaps, tolerance
+from jaxdyn.simulation.hybrid.modes import (
+    Elements,
+    Gram,
+    Mode,
+    StateTerms,
+    by_element,
+    by_normal_row,
+    force_at,
+    force_tolerance,
+    gaps,
+    normal_load,
+    tolerance,
+)
 from jaxdyn.systems.scene import Scene
 
 
@@ -50,15 +61,8 @@ def coefficients(scene: Scene, elements: Elements, dtype) -> Coefficients:
 
 
 def normal_loads(scene: Scene, elements: Elements, q, v, t) -> Array:
-    """Given normal forces of frictions, (n,), zero where they are negative: such friction would drive the motion."""
-    loads = []
-    for one in elements.each:
-        normal: Any = force_at(scene, one).normal if one.normal < 0 else 0.0
-        value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
-        if jnp.shape(value) != ():
-            raise ValueError(f"friction {one.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
-        loads.append(jnp.maximum(jnp.asarray(value, q.dtype), 0.0))
-    return jnp.stack(loads)
+    """Given normal forces of frictions, (n,), zero of others."""
+    return jnp.stack([normal_load(scene, one, q, v, t) for one in elements.each])
 
 
 def directions(scene: Scene, elements: Elements, mode: Mode, slip, reference) -> Array:

@@ -18,8 +18,7 @@ from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.modes import Elements, Mode
-from jaxdyn.simulation.hybrid.projection import project
+from jaxdyn.simulation.hybrid.modes import Elements, Mode, StateTerms, by_normal_row, gaps, terms_at, tolerance
 from jaxdyn.simulation.hybrid.reactions import (
     ROUNDING,
     Collision,
@@ -33,7 +32,6 @@ from jaxdyn.simulation.hybrid.reactions import (
     react,
     rebounds,
 )
-from jaxdyn.simulation.hybrid.rows import StateTerms, by_normal_row, gaps, terms_at, tolerance
 from jaxdyn.simulation.hybrid.transitions import (
     SLIDES,
     STICKS,
@@ -45,6 +43,7 @@ from jaxdyn.simulation.hybrid.transitions import (
     guess_again,
     impulsive_mode,
     length,
+    project,
     rates_of,
     search_mode,
     with_excess,
@@ -107,7 +106,7 @@ class ModalSystem(HybridSystem):
     leaves, with forces in the pieces where the switching functions are `positive`; `y0`, a state.
     """
 
-    def __init__(self, bind: Callable, elements: Elements, solver: diffrax.AbstractERK, y0):
+    def __init__(self, bind: Callable, elements: Elements, solver: diffrax.AbstractAdaptiveSolver, y0):
         leaves, tree = jax.tree.flatten(y0)
         shapes = tuple(x.shape for x in leaves)
         self._bind, self.elements = bind, elements

@@ -1,7 +1,19 @@
-"""Choice of solver, step-size control and adjoint: the user's options as diffrax's objects."""
+"""Choice of solver, step-size control, adjoint and loop: the user's options as diffrax's objects, and who makes the steps.
+
+The first row that applies decides.
+
+    solver  given by the user               that one
+            method "variational"            its own steps (`Stepper`)
+            forces that are stiff           `Rodas5P`, for adaptive steps and concrete inputs
+            stepsize a length               `RK4`
+            else                            `Dopri8`
+    loop    forces with modes               `hybrid/event_loop.py`
+            else                            the rows of `_LOOPS`
+"""
 
 import importlib.util
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -10,11 +22,9 @@ import numpy as np
 import optimistix
 
 from jaxdyn.compile.known import is_known
-from jaxdyn.simulation.options import ADJOINTS, check_step_length, is_backsolve, is_step_length
-from jaxdyn.simulation.solvers.fixed_steps import RK4
-from jaxdyn.simulation.solvers.lie import LieGroup
-from jaxdyn.simulation.solvers.rosenbrock import Rodas5P
-from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps
+from jaxdyn.simulation.options import ADJOINTS, Options, check_step_length, is_backsolve, is_step_length
+from jaxdyn.simulation.solvers.base import Adaptive, ErrorMonitoredSteps
+from jaxdyn.simulation.solvers.diffrax_methods import RK4, LieGroup, Rodas5P
 from jaxdyn.systems.scene import Scene
 
 if TYPE_CHECKING:
@@ -91,10 +101,11 @@ def label(solver: diffrax.AbstractSolver) -> str:
     return f"{name}({label(inner)})" if isinstance(inner, diffrax.AbstractSolver) else name
 
 
-def is_explicit(solver: diffrax.AbstractSolver) -> bool:
-    """True for an explicit Runge-Kutta method, whose steps the library makes itself."""
+def has_own_loop(solver: diffrax.AbstractSolver) -> bool:
+    """True for a method whose steps the library makes itself: an explicit Runge-Kutta method, or `Rodas5P`."""
     # diffrax reports a method that wraps an explicit one as explicit.
-    return isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+    is_explicit = isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+    return is_explicit or type(solver) is Rodas5P
 
 
 def is_split(solver: diffrax.AbstractSolver) -> bool:
@@ -198,3 +209,55 @@ def _has_coarse_dense_output(solver, term) -> bool:
         degrees.append(interpolation.coeffs.shape[1])  # of the methods of Kennedy and Carpenter
     # A polynomial of degree p has an error of order h^(p+1) between steps.
     return bool(degrees) and max(degrees) + 1 < order
+
+
+class _Facts(NamedTuple):
+    """Facts by which a loop is chosen."""
+
+    solver: diffrax.AbstractSolver
+    controller: Any
+    options: Options
+    guards: Callable | None
+    quality: Callable | None
+    pieces: tuple[str, ...]
+
+    def is_by_diffrax(self) -> bool:
+        """True for an adjoint that diffrax alone has."""
+        return isinstance(self.options.adjoint, diffrax.BacksolveAdjoint) or not has_name(self.options.adjoint)
+
+
+# When a row applies, the loop that makes the steps, and why they cannot end at the kinks of piecewise forces. Subclasses and
+# wrappers of controllers, such as a clip to samples, have rules that our loops do not know.
+_LOOPS: tuple[tuple[Callable[[_Facts], bool], str, str], ...] = (
+    (
+        lambda x: not has_own_loop(x.solver),
+        "diffrax",
+        "solver is {solver}; take jd.solvers.Rodas5P(), or an explicit one, such as diffrax.Dopri8()",
+    ),
+    (
+        lambda x: type(x.controller) not in (Adaptive, ErrorMonitoredSteps),
+        "diffrax",
+        "stepsize is a controller; leave it out",
+    ),
+    (_Facts.is_by_diffrax, "diffrax", "adjoint is {adjoint}; take 'reverse'"),
+    (lambda x: x.options.progress, "diffrax", "progress is shown; leave it out"),
+    (
+        lambda x: x.guards is not None,
+        "steps",
+        "contacts, limits, a terminal event or the control may end the run; pass jd.events.ContactLost(stop=False) and no other "
+        "events",
+    ),
+    (lambda x: x.quality is not None, "steps", "method is 'reduced'; take 'projected'"),
+    (lambda x: bool(x.pieces), "pieces", ""),
+    (lambda x: True, "steps", ""),
+)
+
+
+def choose_loop(solver, controller, options: Options, guards, quality, pieces: tuple[str, ...]) -> tuple[str, str]:
+    """Loop of a run, "diffrax", "pieces" or "steps", and why its steps cannot end at the kinks of forces.
+
+    "steps" and "pieces" are loops of the library, and "pieces" ends steps at kinks.
+    """
+    facts = _Facts(solver, controller, options, guards, quality, pieces)
+    loop, reason = next((loop, reason) for applies, loop, reason in _LOOPS if applies(facts))
+    return loop, reason.format(solver=label(options.solver), adjoint=type(options.adjoint).__name__)

@@ -20,9 +20,7 @@ from jaxdyn.compile import kernel
 from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_loop
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.simulation.solvers import reverse
-from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
-from jaxdyn.simulation.solvers.guards import Point, Search, look_within, search_root
-from jaxdyn.simulation.solvers.step_control import (
+from jaxdyn.simulation.solvers.base import (
     NextStep,
     add_error,
     error_size,
@@ -32,6 +30,8 @@ from jaxdyn.simulation.solvers.step_control import (
     no_sums,
     too_coarse,
 )
+from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
+from jaxdyn.simulation.solvers.guards import Point, Search, look_within, search_root
 
 # Floating-point numbers before the end of a run from which a step goes to the end: what is left is rounding, and a step of its
 # own for it would be shorter than the least one.

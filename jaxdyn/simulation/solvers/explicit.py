@@ -52,7 +52,7 @@ class ExplicitSteps(ProjectedSolver):
     **Arguments:** those of `ProjectedSolver`; `project`: None for none; `field(t, y, args)`, the vector field of the term.
     """
 
-    solver: diffrax.AbstractERK
+    solver: diffrax.AbstractAdaptiveSolver
     project: Callable | None = None
     field: Callable = eqx.field(static=True, kw_only=True)
 
@@ -104,8 +104,8 @@ class Plan(NamedTuple):
 
     @property
     def tableau(self) -> Any:
-        """Butcher tableau of the method."""
-        return self.solver.tableau
+        """Butcher tableau of an explicit method, None of `Rodas5P`."""
+        return getattr(self.solver, "tableau", None)
 
     @property
     def count(self) -> int:
@@ -140,7 +140,9 @@ class Plan(NamedTuple):
     @property
     def projects_before_last(self) -> bool:
         """True if the last stage comes after the projection."""
-        return self.project is not None and keeps_fsal(self.tableau, self.step_constants, self.branching)
+        if self.tableau is None or self.project is None:
+            return False
+        return keeps_fsal(self.tableau, self.step_constants, self.branching)
 
     @property
     def knows_error(self) -> bool:
@@ -150,6 +152,8 @@ class Plan(NamedTuple):
     @property
     def is_fsal(self) -> bool:
         """True if the last stage is the first one of the next step (first same as last)."""
+        if self.tableau is None:
+            return False
         return self.tableau.fsal and (self.project is None or self.projects_before_last)
 
     def structure(self, flat):
@@ -177,9 +181,13 @@ class Plan(NamedTuple):
 
     def stage(self, args, t0, t1, y, c, side):
         """Step length times the vector field, at one of the `times` and from one of the `sides`."""
+        return self.change(args, t0, t1, y, jnp.where(c == 1, t1, t0 + c * (t1 - t0)), side)
+
+    def change(self, args, t0, t1, y, t, side):
+        """Step length times the vector field at a time within the step, from one of the `sides`."""
         # By more than the rounding of ends of steps and of times of samples, which are seldom computed alike.
         away = 4 * jnp.finfo(jnp.result_type(t0, t1)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0)) + lax.stop_gradient(side * jnp.sign(t1 - t0) * away)
+        t = t + lax.stop_gradient(side * jnp.sign(t1 - t0) * away)
         return jnp.asarray(t1 - t0, y.dtype) * self.field_of(args, t, y)
 
     def project_end(self, args, t1, y, error):
@@ -205,8 +213,9 @@ def take_step(plan: Plan, args, t0, t1, y, rate) -> Step:
     """Make a step from t0 to t1; `rate` is the vector field at y if the method is first-same-as-last."""
     dt = jnp.asarray(t1 - t0, y.dtype)
     projected, shift, error, raw, stages = _stages(plan, args, t0, t1, y, dt * rate if plan.is_fsal else None)
-    # A step of no length leaves its state, and the rate with it.
-    rate = jnp.where(dt == 0, rate, stages[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt))
+    if plan.is_fsal:
+        # A step of no length leaves its state, and the rate with it.
+        rate = jnp.where(dt == 0, rate, stages[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt))
     return Step(projected, shift, error, raw, stages, rate)
 
 
@@ -241,7 +250,12 @@ def _stages(plan: Plan, args, t0, t1, start, first=None):
 
     `first`: the first stage, or None.
     """
-    count, none = plan.count, jnp.zeros_like(start)
+    none = jnp.zeros_like(start)
+    if plan.tableau is None:
+        method: Any = plan.solver
+        raw, error, k = method.advance(partial(plan.change, args, t0, t1), start, t0, t1)
+        return _with_projected_end(plan, args, t1, raw, error, k)
+    count = plan.count
     times, sides = (jnp.asarray(x, jnp.result_type(t0, t1)) for x in (plan.times, plan.sides))
     *starts, of_end, of_error = jnp.asarray(plan.sums, start.dtype)
 
@@ -264,13 +278,17 @@ def _stages(plan: Plan, args, t0, t1, start, first=None):
     begin = jnp.zeros((count, start.size), start.dtype), start, none, none
     (k, *end), _ = lax.scan(stage, begin, (jnp.arange(count), jnp.stack(starts), times, sides))
     raw, error = start + matmul(of_end, k), matmul(of_error, k)
-    if plan.project is None:
-        return raw, none, error, raw, k
     if not plan.projects_before_last:
-        end = plan.project_end(args, t1, raw, error)
+        return _with_projected_end(plan, args, t1, raw, error, k)
     projected, shift, tangent = end
-    error = enlarge(error, tangent) if plan.projects_before_last and not plan.knows_error else tangent
-    return projected, shift, error, raw, k
+    return projected, shift, tangent if plan.knows_error else enlarge(error, tangent), raw, k
+
+
+def _with_projected_end(plan: Plan, args, t1, raw, error, k):
+    """Projected end of a step, its shift, its error, the end before the projection, and the stages."""
+    if plan.project is None:
+        return raw, jnp.zeros_like(raw), error, raw, k
+    return *plan.project_end(args, t1, raw, error), raw, k
 
 
 def keeps_fsal(tableau, step_constants: tuple[str, ...], branching: bool) -> bool:

@@ -1,8 +1,15 @@
-"""Derivatives of an integration by its own steps, whatever made them, and the runs by explicit steps (`driver`)."""
+"""Derivatives of an integration by its own steps, whatever made them: runs by explicit steps (`driver`), and in diffrax's loop.
+
+diffrax recomputes steps from checkpoints. Their lengths follow from error estimates, whose last digits depend on the program,
+and the program is another one there: one may refuse a step that the other keeps, and the parts that are put together belong to
+two different runs. Here the forward run records the ends of its steps, so that nothing is left to decide on the way back, which
+has no error estimates and no refused steps either.
+"""
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,8 +20,10 @@ from jaxdyn.compile import reverse_only
 from jaxdyn.compile.loops import Given
 from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.simulation.solvers import driver, reverse
+from jaxdyn.simulation.solvers.choice import innermost
 from jaxdyn.simulation.solvers.driver import AdaptiveSteps, FixedSteps
 from jaxdyn.simulation.solvers.explicit import Plan
+from jaxdyn.simulation.solvers.guards import delay
 
 FORWARD = (
     'forward mode (jax.jvp, jax.jacfwd) through a run or a step needs adjoint="forward", of jd.simulate or jd.stepper'
@@ -196,3 +205,227 @@ class ExplicitRun(Integrator):
             return x if varies else None
 
         return jax.tree.map(or_none, structure(of_y), perturbed[0]), of_args, or_none(of_ts, perturbed[2])
+
+
+# --- runs in diffrax's loop, whose reverse mode takes the steps of the forward run ---
+
+
+COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
+ROOM = 4096  # steps that are recorded where the user gives no limit: 32 kB a trajectory
+
+
+class DiffraxRun(NamedTuple):
+    """Arguments of a run in diffrax's loop, as of `diffrax.diffeqsolve`.
+
+    `record`: True to save the times at which steps ended too; `end`, (), s: a time whose state is returned as that of the event.
+    """
+
+    term: Any
+    solver: Any
+    controller: Any
+    event: diffrax.Event | None
+    adjoint: diffrax.AbstractAdjoint
+    max_steps: int
+    progress: diffrax.AbstractProgressMeter
+    dt0: Any
+    record: bool = False
+    end: Any = None
+
+
+def run(inputs, given: DiffraxRun):
+    """diffrax's solution from one end of the save points to the other.
+
+    **Arguments:** `inputs`, what may be differentiated: the initial state, `args`, and the save points (nt,) with the start in
+    front.
+
+    **Returns:** rows of the state at ts[1:]; the result, the counts, the time reached and, if the time of an event is located,
+    the state there; all that diffrax returned.
+    """
+    y0, args, ts = inputs
+    located, end = _is_located(given.event), given.end
+    saves = diffrax.SubSaveAt(ts=ts[1:])
+    last = diffrax.SubSaveAt(t1=True, fn=_state if located else _nothing)
+    last = last if end is None else diffrax.SubSaveAt(ts=end[None])
+    ends = (diffrax.SubSaveAt(steps=True, fn=_nothing),) if given.record else ()
+    saveat = diffrax.SaveAt(subs=(saves, last, *ends), controller_state=True)
+    continuous = isinstance(given.adjoint, diffrax.BacksolveAdjoint)  # supports save points and nothing else
+    solved: Any = diffrax.diffeqsolve(
+        given.term,
+        _with_scan(given.solver, given.adjoint),
+        t0=ts[0],
+        t1=ts[-1],
+        dt0=given.dt0,
+        y0=y0,
+        args=args,
+        saveat=diffrax.SaveAt(subs=saves) if continuous else saveat,
+        stepsize_controller=given.controller,
+        adjoint=given.adjoint,
+        event=given.event,
+        max_steps=given.max_steps,
+        throw=False,
+        progress_meter=given.progress,
+    )
+    counts = {name: solved.stats[name] for name in COUNTS}
+    if continuous:
+        reached = jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
+        return solved.ys, (solved.result, counts, reached), solved
+    end = (jax.tree.map(lambda rows: rows[0], solved.ys[1]),) if located or end is not None else ()
+    return solved.ys[0], (solved.result, counts, solved.ts[1][0], *end), solved
+
+
+def _with_scan(solver, adjoint):
+    """The method with loops over its stages that forward mode can differentiate, where an adjoint needs these.
+
+    diffrax sets them on a method, or on one in a wrapper; in two wrappers it does not see the method.
+    """
+    kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
+    inner = innermost(solver)
+    if kind is None or not isinstance(inner, diffrax.AbstractRungeKutta) or inner.scan_kind is not None:
+        return solver
+    return eqx.tree_at(lambda solver: innermost(solver).scan_kind, solver, kind, is_leaf=lambda x: x is None)
+
+
+def run_adaptively(inputs, given: DiffraxRun, limit_is_given: bool) -> tuple[Any, tuple]:
+    """Rows and facts of `run` with adaptive steps whose ends are constants to reverse mode.
+
+    The time of an event then follows from the state at its end.
+    """
+    if not isinstance(given.controller, diffrax.AbstractAdaptiveStepSizeController):
+        return run(inputs, given)[:2]  # with steps that are given, as those of `diffrax.StepTo`
+    numbers, rest = eqx.partition(given, eqx.is_array)
+    # Tolerances and limits decide which steps are made, and the steps are constants here.
+    given = eqx.combine(jax.lax.stop_gradient(numbers), rest)
+    room = given.max_steps if limit_is_given else min(given.max_steps, ROOM)
+    if isinstance(given.adjoint, diffrax.RecursiveCheckpointAdjoint):
+        return _with_end(_run(reverse_only(inputs, FORWARD), given, room), inputs[1], given)
+    if isinstance(given.adjoint, diffrax.DirectAdjoint):
+        numbers, rest = eqx.partition(inputs, eqx.is_array)
+        facts, steps = _record(eqx.combine(jax.lax.stop_gradient(numbers), rest), given, given.max_steps)[1:]
+        rows, repeated, _ = run(inputs, _repeat(given, steps, facts[2]))
+        return _with_end((rows, (*facts[:3], *repeated[3:])), inputs[1], given)
+    return run(inputs, given)[:2]
+
+
+@eqx.filter_custom_vjp
+def _run(inputs, given, room):
+    return run(inputs, given)[:2]
+
+
+@_run.def_fwd
+def _(perturbed, inputs, given, room):
+    rows, facts, steps = _record(inputs, given, room)
+    return (rows, facts), (steps, facts[2])
+
+
+@_run.def_bwd
+def _(residuals, gradients, perturbed, inputs, given, room):
+    free, fixed = eqx.partition(inputs, perturbed)
+    given = _repeat(given, *residuals)
+
+    def states(free):
+        rows, facts, _ = run(eqx.combine(free, fixed), given)
+        return rows, facts[3:]
+
+    values, pull = eqx.filter_vjp(states, free)
+    of_states = gradients[0], gradients[1][3:]
+    return pull(jax.tree.map(lambda y, g: jnp.zeros_like(y) if g is None else g, values, of_states))[0]
+
+
+def _is_located(event) -> bool:
+    """True for an event whose time within a step is found."""
+    return event is not None and event.root_finder is not None
+
+
+def _with_end(solved, args, given: DiffraxRun):
+    """Rows and facts, whose time of an event has its derivative."""
+    rows, (result, counts, reached, *last) = solved
+    if not last:
+        return solved
+    codes: Any = diffrax.RESULTS
+    event: Any = given.event
+    term, (end,) = given.term, last
+    y, unravel = ravel_pytree(end)
+
+    def guard(known, t, y):
+        args, condition = known
+        return condition(t, unravel(y), args)
+
+    def field(known, t, y):
+        return ravel_pytree(term.vf_prod(t, unravel(y), known[0], term.contr(t, t + 1)))[0]
+
+    late = delay(guard, field, (args, event.cond_fn), reached, y)
+    return rows, (result, counts, reached + jnp.where(result == codes.event_occurred, late, 0.0), end)
+
+
+def _record(inputs, given: DiffraxRun, room):
+    """Rows and facts of `run`, and the controller that repeats its steps."""
+    recorded = given._replace(adjoint=diffrax.ForwardMode(), max_steps=room, record=True)
+    rows, facts, solution = run(inputs, recorded)
+    starts, jumps = solution.ts[2], _jumps(given.controller)
+    ends = starts
+    if jumps is not None:
+        # A step ends at the number before a jump, and the next one starts at the second one after it.
+        before, after = _beside(jumps, -1), _beside(_beside(jumps, 1), 1)
+        is_jump = (starts[:, None] > before[None]) & (starts[:, None] <= after[None])
+        ends = jnp.where(is_jump.any(1), before[is_jump.argmax(1)], starts)
+    controller = _GivenSteps(ends, None if jumps is None else starts, solution.stats["num_accepted_steps"])
+    return rows, facts, jax.lax.stop_gradient(controller)
+
+
+def _repeat(given: DiffraxRun, controller, end):
+    """Options of a run that repeats steps, with the state at the time `end` if that is the time of an event."""
+    end = jax.lax.stop_gradient(end) if _is_located(given.event) else None
+    meter, most = diffrax.NoProgressMeter(), controller.ends.shape[0]
+    return given._replace(controller=controller, max_steps=most, progress=meter, event=None, end=end)
+
+
+class _GivenSteps(diffrax.AbstractStepSizeController):
+    """Step-size control by steps that were recorded."""
+
+    ends: jax.Array
+    starts: jax.Array | None
+    count: jax.Array
+
+    def wrap(self, direction):
+        return self
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        # Where no step was kept, one of no length.
+        return jnp.where(self.count > 0, _along(self.ends[0], t0), t0), jnp.asarray(1)
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        # Behind the last record the index is held within the array: the code reports that steps are missing.
+        row = jnp.minimum(controller_state, self.ends.shape[0] - 1)
+        over = controller_state >= self.count
+        start = t1 if self.starts is None else jnp.where(over, t1, _along(self.starts[controller_state - 1], t1))
+        end = jnp.where(over, t1, _along(self.ends[row], t1))
+        codes: Any = diffrax.RESULTS
+        result = codes.where(over, codes.max_steps_reached, codes.successful)
+        # With jumps the state of the previous step is not valid any more.
+        return True, start, end, self.starts is not None, controller_state + 1, result
+
+
+def _jumps(controller):
+    """Times of jumps at which a step-size control ends and begins a step, if any."""
+    if isinstance(controller, diffrax.ClipStepSizeController):
+        return _jumps(controller.controller) if controller.jump_ts is None else controller.jump_ts
+    return None
+
+
+def _beside(t, side: int):
+    """Next floating-point number on a side, as diffrax computes it: none is denormal."""
+    tiny = jnp.full_like(t, side * jnp.finfo(t.dtype).tiny)
+    return jnp.where(t == 0, tiny, jnp.nextafter(t, jnp.full_like(t, side * jnp.inf)))
+
+
+def _along(t, base):
+    """Time `t`, with the derivatives of `base`."""
+    return t + (base - jax.lax.stop_gradient(base))
+
+
+def _nothing(t, y, args):
+    return None
+
+
+def _state(t, y, args):
+    return y

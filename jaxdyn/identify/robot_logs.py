@@ -1,4 +1,4 @@
-"""Logs of a robot's fit, with the weights and loads that are updated between fits."""
+"""Logs of a robot, and what its fits update in turn: weights of joints and samples, and loads of gears."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -18,7 +18,7 @@ from jaxdyn.identify.condensed_fit import (
     intervals,
     is_negligible,
 )
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.omitted_terms import find_shifts, include_shifts
@@ -37,8 +37,11 @@ _TAIL = 0.04
 _WEIGHINGS = 3
 
 
-class RobotProblem:
-    """Logs of a robot, with the weights of joints and of samples and the loads of gears, which are updated between fits."""
+class RobotLogs:
+    """Logs of a robot, with the weights of joints and of samples and the loads of gears, which are updated between fits.
+
+    A fit of them at a setting poses a `TorqueProblem`.
+    """
 
     def __init__(self, model: Model, logs: tuple[Log, ...], basic, extra: tuple[TorqueTerm, ...], inertia, blocks: int):
         self.model, self.logs, self.basic, self.extra = model, logs, basic, extra
@@ -194,9 +197,9 @@ class RobotProblem:
         columns = free_columns(self.model.nb, self.model.nv, self.basic)
         return include_shifts(found, shifts, np.array(sorted(fitted)), columns)
 
-    def with_term(self, term: TorqueTerm) -> "RobotProblem":
+    def with_term(self, term: TorqueTerm) -> "RobotLogs":
         """Copy with the columns of one more term, after all others."""
-        wide = RobotProblem(self.model, self.logs, self.basic, (*self.extra, term), self.inertia, self.blocks)
+        wide = RobotLogs(self.model, self.logs, self.basic, (*self.extra, term), self.inertia, self.blocks)
         # Those of the fit: intervals are of the estimate that exists, not of a new one.
         wide.weights, wide.loads, wide.sample_weights = self.weights, self.loads, self.sample_weights
         return wide
@@ -256,7 +259,7 @@ class RobotProblem:
 class _Folds(NamedTuple):
     """The fits of a cross-validation as tasks."""
 
-    problem: RobotProblem
+    problem: RobotLogs
 
     @on_one_thread
     def squares(self, pair: tuple[Setting, np.ndarray]) -> np.ndarray:
@@ -264,7 +267,7 @@ class _Folds(NamedTuple):
         return self.problem.validation_squares(*pair)
 
 
-def cross_validation(problem: RobotProblem, engine: Engine) -> Callable:
+def cross_validation(problem: RobotLogs, engine: Engine) -> Callable:
     """Function from pairs of a setting and left-out blocks to the squared errors of these, by an engine of tasks."""
     sent = None
 

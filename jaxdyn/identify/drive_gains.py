@@ -18,11 +18,11 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.identify.condensed import Blocks
 from jaxdyn.identify.condensed_fit import MOST_ROUNDS, is_negligible
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import (
+    Blocks,
     base_parameters,
     condense_model,
     coordinate_names,

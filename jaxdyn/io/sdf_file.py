@@ -8,11 +8,13 @@ Source: sdformat.org, "Pose frame semantics", and the descriptions of each versi
 """
 
 import dataclasses
+import math
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxdyn.io.loaded import UNLIMITED
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.builder import unknown
@@ -227,3 +229,153 @@ class SdfFile(XmlFile):
                     continue  # it stands for the world
                 return name if tag == "link" else self.canonical_link(self.models[name])
         return None
+
+
+def inertia_of(file: SdfFile, link: str) -> np.ndarray:
+    """Ten inertial parameters of a link in its frame."""
+    element, what = file.links[link][0], f"link {link!r}"
+    inertial = element.find("inertial")
+    if inertial is None:
+        # The format's default inertial: 1 kg and the unit matrix.
+        return np.asarray(host_math.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what))
+    # Version 1.11 of the format computes inertias from shapes where this attribute is set.
+    if (inertial.get("auto") or "").strip().lower() in ("1", "true"):
+        raise file.fault(
+            inertial,
+            f"the inertia of {what} is to be computed from its shapes, which is not supported; write <mass> "
+            "and <inertia> (`gz sdf --inertial-stats FILE` prints them)",
+        )
+    get = lambda tag, default: file.number(inertial, f"inertia/{tag}", default, what)  # noqa: E731
+    # Each missing entry has a default of its own, also in an <inertia> that gives others.
+    xx, yy, zz = get("ixx", 1.0), get("iyy", 1.0), get("izz", 1.0)
+    xy, xz, yz = get("ixy", 0.0), get("ixz", 0.0), get("iyz", 0.0)
+    mass = file.number(inertial, "mass", 1.0, what)
+    pose = inertial.find("pose")
+    # The format has no frames here; a file that names one means another centre of mass than it says.
+    if pose is not None and (named := pose.get("relative_to")):
+        raise file.fault(
+            pose,
+            f"<pose> of <inertial> of {what} is relative to {named!r}; give it in the link's frame, without relative_to",
+        )
+    try:
+        about_com = (mass, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        return np.asarray(
+            host_math.move_inertia(file.raw_pose(inertial, what), host_math.inertia_numbers(about_com, what))
+        )
+    except ValueError as error:
+        raise error if str(error).startswith(file.path) else file.fault(inertial, str(error)) from error
+
+
+# --- joints of an SDF file as data in world axes ---
+
+
+# Axes of each kind. A gearbox is a coupling of two other joints, not a joint.
+AXES = dict(revolute=1, continuous=1, prismatic=1, screw=1, revolute2=2, universal=2, ball=0, fixed=0, gearbox=2)
+# Kind of `jd.loop` for each kind of joint; screws and gearboxes cannot close loops.
+LOOPS = dict(revolute="revolute", continuous="revolute", prismatic="prismatic", universal="universal")
+LOOPS |= dict(revolute2="universal", ball="spherical", fixed="weld")
+
+
+class Axis(NamedTuple):
+    """Joint axis: direction (3,) in world axes, spring, and arguments of `ModelBuilder.add_body`."""
+
+    direction: np.ndarray
+    stiffness: float
+    rest: float
+    leaves: dict[str, Any]
+    limited: bool
+    mimic: Any
+
+
+class Joint(NamedTuple):
+    """Joint between two links (None: the world), with its pose in the world, its axes and its pitch (m/rad)."""
+
+    name: str
+    kind: str
+    parent: str | None
+    child: str | None
+    pose: np.ndarray
+    axes: tuple[Axis, ...]
+    pitch: float
+    cut: bool  # the file asks for a loop to be cut here
+    element: Any
+
+
+def read_joints(file: SdfFile) -> list[Joint]:
+    """Read all joints of a file, in its order.
+
+    **Raises:** ValueError with file and line for an unknown kind, a bad axis, a screw without a pitch, a joint that
+    joins a link to itself.
+    """
+    joints = []
+    for name, (element, scope) in file.joints.items():
+        kind = element.get("type") or ""
+        if kind not in AXES:
+            raise file.fault(element, f"joint {name!r}: {unknown('type', kind, AXES)}; types are {', '.join(AXES)}")
+        pose = file.joint_pose(name)
+        parent, child = (file.link_of(file.end(name, which)) for which in ("parent", "child"))
+        # Both ends may be None: static models are parts of the world, and joining them has no effect.
+        if parent == child and parent is not None:
+            raise file.fault(element, f"joint {name!r} joins {parent!r} to itself; name two links")
+        tags = ("axis", "axis2")[: AXES[kind]]
+        axes = tuple(_axis(file, name, element, scope, tag, kind, pose) for tag in tags)
+        cut = file.flag(element, "physics/simbody/must_be_loop_joint", f"joint {name!r}")
+        pitch = _pitch(file, name, element) if kind == "screw" else 0.0
+        joints.append(Joint(name, kind, parent, child, pose, axes, pitch, cut, element))
+    return joints
+
+
+def _axis(file: SdfFile, name: str, joint, scope, tag: str, kind: str, pose: np.ndarray) -> Axis:
+    what = f"joint {name!r}"
+    element = joint.find(tag)
+    xyz = None if element is None else element.find("xyz")
+    # A missing axis is z from version 1.7 on; earlier files have to state it.
+    if xyz is None and (tag == "axis2" or file.minor < 7):
+        raise file.fault(joint if element is None else element, f"{what} is {kind} and has no <{tag}> with <xyz>")
+    values = np.array([0.0, 0.0, 1.0]) if xyz is None else file.numbers(xyz, 3, f"<{tag}> of {what}")
+    if not values.any():
+        raise file.fault(xyz, f"<xyz> of <{tag}> of {what} is zero; give a direction")
+    # From 1.5 on, axes are in the joint's own frame by default.
+    turn = pose[:3, :3]
+    inside = (xyz.get("expressed_in") or "").strip() if xyz is not None else ""
+    if file.minor >= 7 and file.flag(element, "use_parent_model_frame", what):
+        raise file.fault(
+            element,
+            f"<use_parent_model_frame> of {what} is of versions 1.5 and 1.6; write expressed_in='__model__' in its <xyz>",
+        )
+    # Up to 1.4 axes are in the model's frame; in 1.5 and 1.6 where the file says so.
+    if file.minor < 7 and (file.minor == 4 or file.flag(element, "use_parent_model_frame", what)):
+        turn = file.pose(scope.frame)[:3, :3]
+    elif inside:
+        turn = file.pose(file.find(inside, scope, xyz))[:3, :3]
+    get = lambda tag, default, **how: file.number(element, tag, default, what, **how)  # noqa: E731
+    lower, upper = get("limit/lower", -np.inf, finite=False), get("limit/upper", np.inf, finite=False)
+    limited = kind != "continuous" and (lower > -UNLIMITED or upper < UNLIMITED)
+    leaves: dict[str, Any] = {}
+    # Files write huge finite numbers for no limit; only finite limits become leaves.
+    if limited:
+        leaves = {"lower": lower if lower > -UNLIMITED else -np.inf, "upper": upper if upper < UNLIMITED else np.inf}
+    for key, path in (("effort_limit", "limit/effort"), ("velocity_limit", "limit/velocity")):
+        value = get(path, -1.0, finite=False)  # negative: no limit
+        if 0 <= value < UNLIMITED:
+            leaves[key] = value
+    for key in ("damping", "friction"):
+        # Zero is the format's default; a leaf of zeros would be a force that does nothing.
+        if value := get(f"dynamics/{key}", 0.0):
+            leaves[key] = value
+    stiffness, rest = get("dynamics/spring_stiffness", 0.0), get("dynamics/spring_reference", 0.0)
+    mimic = None if element is None else element.find("mimic")
+    return Axis(turn @ host_math.unit(values, what), stiffness, rest, leaves, limited, mimic)
+
+
+def _pitch(file: SdfFile, name: str, joint) -> float:
+    """Metres per radian, positive for a right-handed thread."""
+    what = f"joint {name!r}"
+    if joint.find("screw_thread_pitch") is not None:
+        return file.number(joint, "screw_thread_pitch", 1.0, what) / (2 * math.pi)
+    if joint.find("thread_pitch") is None:
+        raise file.fault(joint, f"{what} is a screw without a pitch; give <screw_thread_pitch> (m per turn)")
+    turns = file.number(joint, "thread_pitch", 1.0, what)  # radians per metre, positive for a left-handed thread
+    if turns == 0:
+        raise file.fault(joint, f"{what}: <thread_pitch> is 0 rad/m; use a fixed joint, or <screw_thread_pitch>")
+    return -1.0 / turns

@@ -12,12 +12,18 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.quantities import torque_regressor
 from jaxdyn.identify.descent import Watch, descend
+from jaxdyn.identify.excitation import (
+    DrivenRobot,
+    FourierMotion,
+    joint_signals,
+    make_robot,
+    motion_from_rest,
+    random_motion,
+)
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.methods import GradientSteps, RandomSteps
 from jaxdyn.identify.regression import base_parameters, free_columns, group_columns
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
-from jaxdyn.identify.workflows.driven import DrivenRobot, joint_signals, make_robot
-from jaxdyn.identify.workflows.excitation import FourierMotion, motion_from_rest, random_motion
 from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import as_scene

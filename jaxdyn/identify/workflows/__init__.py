@@ -1,1 +1,0 @@
-"""Workflows around identification: logs, excitation, drive gains, payloads."""
