@@ -28,6 +28,7 @@ _COMMON = {
     "scene": "the mechanism, with its constraints and forces.",
     "name": "for errors and reports; by default made of the others.",
     "dtype": "of the arrays; by default JAX's, as `jax_enable_x64` says.",
+    "old": "arguments by their names of earlier releases, which are deprecated.",
     "surface_body": "name of the body or frame that carries the surface; None: the world.",
     "plane_body": "name of the body or frame that carries the plane; None: the world.",
     "q": "configuration: rad or m, unit quaternions of free and spherical joints.",
@@ -140,12 +141,12 @@ def rows(text: str, arguments: Sequence[Argument], known: Known | None = None) -
     found = [
         each
         for row in found
-        for each in ([row] if row.text else [Row([pair], _COMMON.get(pair[0].name, "")) for pair in row.arguments])
+        for each in ([row] if row.text else [Row([pair], _common(pair[0])) for pair in row.arguments])
     ]
     described = {row.arguments[0][0].name: row for row in found}
     others = {argument.name for row in found for argument, _ in row.arguments[1:]}
     table = [
-        described.get(argument.name) or Row([(argument, f"`{argument.name}`")], _COMMON.get(argument.name, ""))
+        described.get(argument.name) or Row([(argument, f"`{argument.name}`")], _common(argument))
         for argument in arguments
         if argument.name not in others
     ]
@@ -171,6 +172,10 @@ def descriptions(things: Mapping[str, tuple[str, Sequence[Argument]]]) -> Known:
             described = rows(split(docstring)[1], arguments, known)[1]
             known[name] = {pair[0].name: row.text for row in described if row.text for pair in row.arguments}
     return known
+
+
+def _common(argument: Argument) -> str:
+    return _COMMON.get(argument.name.lstrip("*"), "")
 
 
 def _tidy(text: str) -> str:

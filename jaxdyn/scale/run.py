@@ -164,7 +164,7 @@ def run(
       one rollout, traced.
     - `samples`: number of rollouts where parameters are drawn, which then are not held in memory. `seed`: rollout i has the key
       `jax.random.fold_in(jax.random.key(seed), i)`, for any chunks, devices and workers (see `jd.scale.member`).
-    - `ts` (nt,): save points (s), `control` and further options: as in `jd.simulate`.
+    - `ts` (nt,): save points (s), `control`: as in `jd.simulate`.
     - `out`: directory of the store. Its variables are those of `Solution.to_xarray` over "rollout" and t, with names and
       units; `parameter_NAME`; `result`, a code whose names are its attribute flag_meanings; `num_steps`; `time_reached` (s).
     - `reductions`: a dictionary of `jd.scale.Mean`, `Histogram`, `Quantiles`, `Worst` or your own `Reduction`, of the rollouts
@@ -172,6 +172,7 @@ def run(
     - `rows`: True to store all arrays, False for none (codes and reductions alone), or the names of those to store.
     - `units`: of parameters, by name.
     - `resources`: a `jd.scale.Resources`: workers, devices, sizes of batches and chunks, progress.
+    - `options`: further ones of `jd.simulate`.
 
     **Returns:** a `Run`. A rollout that fails is a row with its code and does not raise.
 
