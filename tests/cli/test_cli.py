@@ -114,8 +114,7 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, tmp_path, cap
         v0,
         np.linspace(0, 0.2, 5),
         control=lambda q, v, t: jd.gravity_force(model, q),
-        rtol=1e-10,
-        atol=1e-10,
+        stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10),
     )
     # Both integrations have a tolerance of 1e-8 or less per step.
     np.testing.assert_allclose(log.q, motion.q, atol=1e-7)

@@ -196,7 +196,9 @@ def test_events_are_those_of_the_exact_mechanism(event, folder):
         whole = jd.Scene(system, scene.constraints, forces)
 
         def run(q, v, whole=whole, options=options):
-            return jd.simulate(whole, q, v, times, rtol=1e-10, atol=1e-10, throw=False, **options)
+            return jd.simulate(
+                whole, q, v, times, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10), throw=False, **options
+            )
 
         motion = (jax.jit(run) if event == "traced friction" else run)(q, v)
         found.append((motion.result, motion.q[:, order], motion.v[:, order], motion.stats["time_reached"]))

@@ -153,7 +153,7 @@ def crank_angles(path, **options):
         warnings.simplefilter("ignore")
         scene = jd.load(path)
     start = jd.assemble(scene, scene.starts["reference"].q, guesses=1)
-    motion = jd.simulate(scene, start.q, start.v, TIMES, rtol=1e-9, atol=1e-9, **options)
+    motion = jd.simulate(scene, start.q, start.v, TIMES, stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9), **options)
     return np.asarray(motion.q[:, 0] - motion.q[0, 0]), motion, start, scene
 
 
@@ -202,7 +202,9 @@ def test_a_four_bar_with_few_digits_moves_as_with_all(tmp_path, exact, kind, dig
 def test_a_traced_start_drops_the_same_rows(tmp_path):
     path = WRITERS["sdf"](tmp_path / "bars", 5, TILT)
     _, motion, start, scene = crank_angles(path)
-    traced = jax.jit(lambda q, v: jd.simulate(scene, q, v, TIMES, rtol=1e-9, atol=1e-9))(start.q, start.v)
+    traced = jax.jit(lambda q, v: jd.simulate(scene, q, v, TIMES, stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9)))(
+        start.q, start.v
+    )
     assert bool(traced.success) and int(traced.stats["redundant_rows"]) == 3
     np.testing.assert_allclose(traced.q, motion.q, atol=1e-7)
     assert "dropped 3 redundant rows" in str(motion)

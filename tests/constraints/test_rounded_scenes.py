@@ -154,7 +154,9 @@ def gauge_law(scene, q, v):
 
 
 def moved(scene, q, v):
-    motion = jd.simulate(scene, q, v, jnp.array([0.0, 0.05]), rtol=1e-10, atol=1e-10, throw=False)
+    motion = jd.simulate(
+        scene, q, v, jnp.array([0.0, 0.05]), stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10), throw=False
+    )
     return motion.success, [motion.q[-1], motion.v[-1]]
 
 

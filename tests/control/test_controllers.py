@@ -94,8 +94,8 @@ def test_adaptive_steps_integrate_a_state_as_fixed_ones_do():
     scene = scenes.spherical_pendulum()
     q0, v0 = scenes.spherical_pendulum.start()
     outputs = ("control_state", "multipliers")
-    steps = {"rtol": 1e-10, "atol": 1e-10}, {"stepsize": 0.002}  # the filter sums the errors of multipliers up to 20 N
-    ends = [jd.simulate(scene, q0, v0, TS, control=Filtered(), outputs=outputs, **each) for each in steps]
+    steps = jd.simulation.Steps(rtol=1e-10, atol=1e-10), 0.002  # the filter sums the errors of multipliers up to 20 N
+    ends = [jd.simulate(scene, q0, v0, TS, control=Filtered(), outputs=outputs, stepsize=each) for each in steps]
     np.testing.assert_allclose(ends[0].control_state, ends[1].control_state, atol=1e-7)
     fine = jnp.linspace(0.0, 0.5, 501)
     lam = jd.simulate(scene, q0, v0, fine, outputs=("multipliers",), stepsize=0.001).multipliers[:, 0]

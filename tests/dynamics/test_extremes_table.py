@@ -165,7 +165,9 @@ def test_motion_passes_singular_positions_at_any_tolerance():
 
     @jax.vmap
     def run(tolerance):
-        computed = simulate(scene, q, v, ts, rtol=tolerance, atol=tolerance, throw=False, max_steps=4096)
+        computed = simulate(
+            scene, q, v, ts, stepsize=jd.simulation.Steps(rtol=tolerance, atol=tolerance, max_steps=4096), throw=False
+        )
         return computed.q, computed.success, computed.stats["num_steps"]
 
     computed, successful, steps = map(np.asarray, jax.jit(run)(tolerances))
@@ -187,7 +189,9 @@ def test_motions_through_many_singular_positions():
     want = references.windows(times, 2).q[place.reshape(256, 6)]
 
     def run(q, v, tolerance):
-        computed = simulate(scene, q, v, ts, rtol=tolerance, atol=tolerance, throw=False, max_steps=2048)
+        computed = simulate(
+            scene, q, v, ts, stepsize=jd.simulation.Steps(rtol=tolerance, atol=tolerance, max_steps=2048), throw=False
+        )
         return computed.q, computed.success
 
     program = jax.jit(jax.vmap(run, (0, 0, None)))

@@ -291,7 +291,7 @@ def test_geodesic_of_the_sphere_is_a_great_circle():
     """Simulated, in float64; and the acceleration in float32."""
     q0, v0, ts = jnp.asarray([1.1, 0.3]), jnp.asarray([0.4, 0.9]), jnp.asarray([0.0, 0.5, 1.0])
     system = jd.MetricSystem(jd.geometry.pull_back(lambda x: jnp.eye(3), sphere), 2)
-    solution = jd.simulate(system, q0, v0, ts, rtol=1e-11, atol=1e-11)
+    solution = jd.simulate(system, q0, v0, ts, stepsize=jd.simulation.Steps(rtol=1e-11, atol=1e-11))
     x, speed = jax.jvp(sphere, (q0,), (v0,))
     rate = jnp.sqrt(jnp.sum(speed * speed)) / 1.7
     circle = jnp.cos(rate * ts)[:, None] * x[None] + jnp.sin(rate * ts)[:, None] * (speed / rate)[None]

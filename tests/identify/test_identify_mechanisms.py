@@ -24,7 +24,9 @@ def moved(scene, q0, v0, motors, size=2.0):
     for k, i in enumerate(motors):
         tau[:, i] = size * np.sin((3.0 + 1.3 * k) * T + 0.7 * k)
     control = jd.identify.SampledTorque(jnp.asarray(T), jnp.asarray(tau))
-    motion = jd.simulate(scene, q0, v0, jnp.asarray(T), control=control, rtol=1e-10, atol=1e-10)
+    motion = jd.simulate(
+        scene, q0, v0, jnp.asarray(T), control=control, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10)
+    )
     return np.asarray(motion.q), np.asarray(motion.v), tau
 
 
@@ -148,7 +150,11 @@ def test_a_toss_tells_gravity_and_ratios_of_inertia():
     builder = jd.ModelBuilder("box", gravity=(0.0, 0.0, -9.81))
     true = builder.add_body("cube", None, "free", jd.inertia.box(MASS, (0.12, 0.1, 0.08))).build()
     logs, rng = [], np.random.default_rng(0)
-    run = jax.jit(jax.vmap(lambda q, v: jd.simulate(true, q, v, jnp.asarray(t), rtol=1e-10, atol=1e-12)))
+    run = jax.jit(
+        jax.vmap(
+            lambda q, v: jd.simulate(true, q, v, jnp.asarray(t), stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-12))
+        )
+    )
     quaternions = rng.normal(size=(6, 4))
     q0 = np.concatenate([rng.normal(size=(6, 3)), quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)], 1)
     motion = run(jnp.asarray(q0), jnp.asarray(rng.normal(size=(6, 6)) * np.array([1.0] * 3 + [8.0] * 3)))

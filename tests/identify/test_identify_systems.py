@@ -27,7 +27,15 @@ TRUE = dict(masses=(1.3, 0.7), length=1.1, reaches=(0.45, 0.4), moments=(0.09, 0
 def log_of(scene, q0, v0, t, tau, noise=0.0):
     """A motion under known torques, integrated far more finely than the fits do, with its accelerations."""
     control = identify.SampledTorque(t, tau)
-    motion = simulate(scene, q0, v0, t, control=control, rtol=1e-12, atol=1e-12, outputs=("acceleration",))
+    motion = simulate(
+        scene,
+        q0,
+        v0,
+        t,
+        control=control,
+        stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12),
+        outputs=("acceleration",),
+    )
     q, v, a = (np.asarray(x) for x in (motion.q, motion.v, motion.acceleration))
     off = noise * np.random.default_rng(1).normal(size=(3, *q.shape))
     return identify.Log(t, q + off[0], v + off[1], a + off[2], tau)
@@ -372,7 +380,7 @@ def test_trajectories_on_constraints():
     t = jnp.linspace(0, 1, 21)
     rod = scenes.pendulum_in_plane()
     held = Scene(rod.system, rod.constraints, (JointDamping(0.3),))
-    motion = simulate(held, *scenes.pendulum_in_plane.start(), t, rtol=1e-12, atol=1e-12)
+    motion = simulate(held, *scenes.pendulum_in_plane.start(), t, stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12))
     log = identify.Log(t, motion.q, motion.v, None, jnp.zeros((21, 2)))
     chosen = lambda scene: [scene.system.parameters["gravity"], scene.forces[0].coefficient]  # noqa: E731
     wrong = eqx.tree_at(chosen, held, [jnp.asarray(7.0), jnp.asarray(0.1)])

@@ -307,7 +307,13 @@ def test_numbers_of_a_controlled_arm_by_its_motion_in_closed_loop():
     """Damping and a mass from a log under a controller; its torques are part of what is compared."""
     true, law, t = scene_of(arm(mass=(2.0, 0.5))), Tracking(), np.linspace(0.0, 1.0, 26)
     motion = jd.simulate(
-        true, jnp.zeros(2), jnp.zeros(2), jnp.asarray(t), control=law, outputs=("torque",), rtol=1e-10, atol=1e-10
+        true,
+        jnp.zeros(2),
+        jnp.zeros(2),
+        jnp.asarray(t),
+        control=law,
+        outputs=("torque",),
+        stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10),
     )
     log = jd.identify.Log(t, *(np.asarray(x) for x in (motion.q, motion.v, np.zeros((26, 2)), motion.torque)))
     wrong = scene_of(arm(mass=(2.0, 0.8), damping=(0.5, 0.5)))

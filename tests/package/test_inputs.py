@@ -198,17 +198,24 @@ def stiffer(q, v, t):
     return -q if t < 0.5 else q
 
 
+GIVEN_STEPS = diffrax.StepTo(jnp.linspace(0, 1, 5))
 OPTIONS = [
-    ({"rtol": np.inf}, "rtol is inf; pass a finite number"),
-    ({"rtol": -1}, "rtol is -1; pass a finite number that is not negative"),
-    ({"atol": np.nan}, "atol is nan"),
-    ({"rtol": "1e-8"}, "rtol is .*; pass an array of numbers"),
-    ({"rtol": [1e-8, 1e-6]}, r"rtol has shape \(2,\); pass one number.*vmap"),
+    ({"stepsize": jd.simulation.Steps(rtol=np.inf)}, "rtol is inf; pass a finite number"),
+    ({"stepsize": jd.simulation.Steps(rtol=-1)}, "rtol is -1; pass a finite number that is not negative"),
+    ({"stepsize": jd.simulation.Steps(atol=np.nan)}, "atol is nan"),
+    ({"stepsize": jd.simulation.Steps(rtol="1e-8")}, "rtol is .*; pass an array of numbers"),
+    ({"stepsize": jd.simulation.Steps(rtol=[1e-8, 1e-6])}, r"rtol has shape \(2,\); pass one number.*vmap"),
     ({"stepsize": "0.1"}, "stepsize is .*; pass an array of numbers"),
     ({"stepsize": -0.1}, "stepsize is -0.1; pass a positive number"),
-    ({"stepsize": 0.1, "rtol": 1e-6}, "rtol is given, and RK4 has no use for it with fixed steps"),
-    ({"stepsize": 0.1, "atol": 1e-6, "solver": diffrax.Tsit5()}, "atol is given, and Tsit5 has no use"),
-    ({"stepsize": diffrax.StepTo(jnp.linspace(0, 1, 5)), "rtol": 1e-6}, "rtol is given, and Dopri8 .* their own steps"),
+    ({"stepsize": jd.simulation.Steps(0.1, rtol=1e-6)}, "rtol is given, and RK4 has no use for it with fixed steps"),
+    (
+        {"stepsize": jd.simulation.Steps(0.1, atol=1e-6), "solver": diffrax.Tsit5()},
+        "atol is given, and Tsit5 has no use",
+    ),
+    (
+        {"stepsize": jd.simulation.Steps(diffrax.StepTo(jnp.linspace(0, 1, 5)), rtol=1e-6)},
+        "rtol is given, and Dopri8 .* their own steps",
+    ),
     (
         {"events": [jd.events.ModeSwitches(8)]},
         r"events has ModeSwitches\(max_events=8\), and no force of the scene has events",
@@ -282,7 +289,8 @@ def test_a_bad_lane_leaves_the_good_one_alone(name, method):
     @jax.jit
     @jax.vmap
     def run(value):
-        return jd.simulate(PENDULUM, **(given | {name: value}), method=method, outputs=("energy",), throw=False)
+        changed = {"stepsize": jd.simulation.Steps(rtol=value)} if name == "rtol" else {name: value}
+        return jd.simulate(PENDULUM, **(given | changed), method=method, outputs=("energy",), throw=False)
 
     values, code = LANES[name]
     both, good = run(values), run(values[:1].repeat(2, 0))
@@ -326,7 +334,7 @@ def test_one_enumeration_of_results():
     ]
     assert all(one.result == jd.RESULTS.successful and one.success for one in solution)
     assert "successful" in str(solution[0].result) and "<>" not in str(solution[3].result)
-    stopped = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 9.0], max_steps=1, throw=False)
+    stopped = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 9.0], stepsize=jd.simulation.Steps(max_steps=1), throw=False)
     assert stopped.result == jd.RESULTS.max_steps_reached != solution[1].result and not stopped.success
 
 

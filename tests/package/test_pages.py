@@ -326,7 +326,9 @@ def has_published_eigenvalues(names):
 
 def agrees_with_simulate(names):
     q, v, ts = (names[x] for x in ("q", "v", "ts"))
-    ours = jd.simulate(names["hand"], q, v, ts, control=names["law"], rtol=1e-9, atol=1e-9)
+    ours = jd.simulate(
+        names["hand"], q, v, ts, control=names["law"], stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9)
+    )
     return np.abs(ours.q - names["configurations"]).max() < 1e-6
 
 

@@ -21,6 +21,7 @@ from jaxdyn.model.configuration import configuration_rate
 from jaxdyn.reduction.bases import as_basis, independent_velocities, tangent_basis
 from jaxdyn.reduction.minimal import reduced_dynamics
 from jaxdyn.simulation.methods import Baumgarte, Reduced
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS as SIMULATION
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -287,7 +288,7 @@ def test_derivatives_at_rest_and_float32():
         np.testing.assert_allclose(dynamics.acceleration, exact, atol=1e-5)
 
 
-TIGHT = {"rtol": 1e-12, "atol": 1e-12}
+TIGHT = {"stepsize": Steps(rtol=1e-12, atol=1e-12)}
 
 
 def moved(scene, state, ts, outputs=("constraint_residual",), **options):
@@ -415,7 +416,7 @@ def test_accelerations_of_baumgarte():
 def test_baumgarte_pulls_back_but_errs():
     """The residual is between those of the other methods."""
     scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(angle=0.4, rate=0.5)
-    options = {"rtol": 1e-8, "atol": 1e-8}
+    options = {"stepsize": Steps(rtol=1e-8, atol=1e-8)}
     opened, pulled, held = (
         moved(scene, (q, v), [0.0, 5.0], method=method, **options).constraint_residual[-1, 0]
         for method in ("multipliers", "baumgarte", "projected")
@@ -437,8 +438,8 @@ scene = andrews()
 q, v = andrews.start()
 
 def success(share):
-    ts, tolerances = jax.numpy.stack([0 * share, 0.002 * share]), {"rtol": 1e-4, "atol": 1e-4}
-    return jd.simulate(scene, q, v, ts, method="reduced", max_steps=4096, throw=False, **tolerances).success
+    ts, steps = jax.numpy.stack([0 * share, 0.002 * share]), jd.simulation.Steps(rtol=1e-4, atol=1e-4, max_steps=4096)
+    return jd.simulate(scene, q, v, ts, method="reduced", stepsize=steps, throw=False).success
 
 found = jax.jit(jax.vmap(success))
 for _ in range(4):

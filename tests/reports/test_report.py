@@ -271,8 +271,8 @@ def test_evaluations_are_those_that_are_made(name, solver):
     scene, (force, calls) = getattr(jd.scenes, name), counting()
     counted = Scene(scene().system, scene().constraints, (force,))
     method = {"Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8, "RK4": RK4}[solver]()
-    steps = {"stepsize": 0.05} if solver == "RK4" else {"rtol": 1e-6, "atol": 1e-6}
-    solution = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, **steps)
+    steps = 0.05 if solver == "RK4" else jd.simulation.Steps(rtol=1e-6, atol=1e-6)
+    solution = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, stepsize=steps)
     jax.effects_barrier()
     assert len(calls) == evaluations(solver, int(solution.stats["num_steps"]), scene(), choose_method(scene(), "auto"))
 

@@ -121,13 +121,17 @@ def test_closures_of_goldberg_and_bricard():
     """Formulas of the literature hold along motions that know nothing of them."""
     times = np.linspace(0.0, 0.6, 4)
     q, v = jd.scenes.bricard.start(angle=0.5)
-    q = np.asarray(jd.simulate(jd.scenes.bricard(), q, v, times, rtol=1e-11, atol=1e-11).q)
+    q = np.asarray(
+        jd.simulate(jd.scenes.bricard(), q, v, times, stepsize=jd.simulation.Steps(rtol=1e-11, atol=1e-11)).q
+    )
     np.testing.assert_allclose(q[:, [2, 4, 3]], q[:, [0, 0, 1]], atol=1e-10)
     c, s, (one, two) = np.cos(1.2), np.sin(1.2), q.T[:2]
     closure = c**2 + s**2 * (np.cos(one) + np.cos(two)) + (1 + c**2) * np.cos(one) * np.cos(two)
     np.testing.assert_allclose(closure - 2 * c * np.sin(one) * np.sin(two), 0, atol=1e-10)
     q, v = jd.scenes.goldberg.start(angle=0.9)
-    q = np.asarray(jd.simulate(jd.scenes.goldberg(), q, v, times, rtol=1e-11, atol=1e-11).q)
+    q = np.asarray(
+        jd.simulate(jd.scenes.goldberg(), q, v, times, stepsize=jd.simulation.Steps(rtol=1e-11, atol=1e-11)).q
+    )
     tangents = np.tan(q / 2)
     constant = np.stack([tangents[:, 0] * tangents[:, 1], tangents[:, 2] / tangents[:, 0]], 1)
     np.testing.assert_allclose(constant, np.broadcast_to(constant[0], constant.shape), rtol=1e-10)
@@ -142,7 +146,7 @@ def test_motion_in_minimal_coordinates(name):
     q, v = begin(one)
     exact = one.states(one.minimal(times, 1e-13)[0])
     outputs = ("energy", "constraint_residual")
-    motion = jd.simulate(one.scene, q, v, times, rtol=1e-12, atol=1e-12, outputs=outputs)
+    motion = jd.simulate(one.scene, q, v, times, stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12), outputs=outputs)
     assert bool(motion.success) and float(motion.constraint_residual.max()) < 1e-12
     assert distance(motion.q, exact[0]) < 1e-10
     # Between steps velocities are interpolated.
@@ -180,7 +184,9 @@ def test_gradients(name):
         inertias = one.scene.system.inertias
         heavier = jnp.concatenate([factors[1:2], jnp.ones((inertias.shape[0] - 1,))])
         scene = jd.Scene(one.scene.system.replace(inertias=inertias * heavier[:, None]), one.scene.constraints)
-        motion = jd.simulate(scene, q, factors[0] * v, times, rtol=1e-11, atol=1e-11, adjoint=adjoint)
+        motion = jd.simulate(
+            scene, q, factors[0] * v, times, stepsize=jd.simulation.Steps(rtol=1e-11, atol=1e-11), adjoint=adjoint
+        )
         return weights @ jnp.concatenate([motion.q[-1], motion.v[-1]])
 
     step, ones = 1e-3, jnp.ones(2)
@@ -200,7 +206,7 @@ def test_a_batch_with_traced_starts(name):
     starts = [begin(one, scale) for scale in (1.0, 0.9, 1.1)]
 
     def run(q, v):
-        motion = jd.simulate(one.scene, q, v, times, rtol=1e-9, atol=1e-9)
+        motion = jd.simulate(one.scene, q, v, times, stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9))
         return motion.q[-1], motion.success
 
     q, success = jax.jit(jax.vmap(run))(*(jnp.stack(x) for x in zip(*starts, strict=True)))
@@ -210,7 +216,12 @@ def test_a_batch_with_traced_starts(name):
         exact = one.states(one.minimal(times, 1e-13, start)[0])[0][-1]
         assert distance(end, exact) < 1e-7
     # Of two rows that are equally far from the others rounding decides which one is kept, and stages lie off the constraints.
-    assert distance(q[0], jd.simulate(one.scene, *starts[0], times, rtol=1e-9, atol=1e-9).q[-1]) < 1e-9
+    assert (
+        distance(
+            q[0], jd.simulate(one.scene, *starts[0], times, stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9)).q[-1]
+        )
+        < 1e-9
+    )
 
 
 @pytest.mark.slow
@@ -219,7 +230,15 @@ def test_rows_that_lose_rank_on_the_way_are_exchanged(tolerance):
     """Four of five rows of Bricard's linkage lose rank where its even angles pass zero, at 0.82 s, but not all five."""
     scene, times = jd.scenes.bricard(), np.array([0.0, 1.0])
     q, v = jd.scenes.bricard.start(branch=-1)
-    motion = jd.simulate(scene, q, v, times, rtol=tolerance, atol=tolerance, outputs=("energy",), throw=False)
+    motion = jd.simulate(
+        scene,
+        q,
+        v,
+        times,
+        stepsize=jd.simulation.Steps(rtol=tolerance, atol=tolerance),
+        outputs=("energy",),
+        throw=False,
+    )
     assert bool(motion.success)
     assert int(motion.stats["num_steps"]) < 20 and np.ptp(motion.energy) < 1e3 * tolerance
 
@@ -233,14 +252,16 @@ def test_rounded_rows_are_exchanged(digits):
     """
     scene, times = jd.scenes.bricard(), np.array([0.0, 0.5, 1.0])
     q, v = jd.scenes.bricard.start(branch=-1)
-    exact = jd.simulate(scene, q, v, times, rtol=1e-10, atol=1e-10)
+    exact = jd.simulate(scene, q, v, times, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10))
     system, constraints = jax.tree.map(
         lambda x: jnp.round(x, digits) if eqx.is_inexact_array(x) else x, (scene.system, scene.constraints)
     )
     rounded = jd.Scene(system.replace(rounding=0.5 * 10.0**-digits), constraints)
     start = jd.assemble(rounded, q, v=v)
     assert bool(start.success)
-    motion = jd.simulate(rounded, start.q, start.v, times, rtol=1e-9, atol=1e-9, throw=False)
+    motion = jd.simulate(
+        rounded, start.q, start.v, times, stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9), throw=False
+    )
     assert bool(motion.success) and int(motion.stats["num_steps"]) < 60
     assert np.abs(motion.q - exact.q).max() < 10 * 0.5 * 10.0**-digits
 

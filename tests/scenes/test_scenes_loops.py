@@ -316,7 +316,7 @@ def test_a01_pendulum_for_2000_seconds():
     @jax.jit
     def run():
         options = {"stepsize": 0.02, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
-        return jd.simulate(scene, q, v, ts, max_steps=110_000, **options)
+        return jd.simulate(scene, q, v, ts, stepsize=jd.simulation.Steps(max_steps=110_000), **options)
 
     computed = run()
     want = [

@@ -18,6 +18,7 @@ from jaxdyn.forces.elements import JointDamping
 from jaxdyn.geometry.immersion import constrain_by_immersion, reaction_force
 from jaxdyn.lie.so3 import hat
 from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
@@ -403,7 +404,13 @@ def test_disk_and_link_in_contact():
 def test_pendulum_has_the_elliptic_motion():
     """Problem A01 of the IFToMM benchmark library, from rest at 90 degrees."""
     q0, v0 = scenes.pendulum.start()
-    solution = simulate(scenes.pendulum(), q0, v0, jnp.asarray([0.0, 1.0, 5.0, 9.99]), rtol=1e-12, atol=1e-12)
+    solution = simulate(
+        scenes.pendulum(),
+        q0,
+        v0,
+        jnp.asarray([0.0, 1.0, 5.0, 9.99]),
+        stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12),
+    )
     angle = np.asarray(solution.q)[1:, 0]
     x, y = np.sin(angle), -np.cos(angle)
     assert_close(x, [0.986291751131875319, -0.942305435043757335, -0.316436469913032291], 1e-9)  # steps add up
@@ -430,8 +437,8 @@ def test_block_sticks_where_it_stops():
     """Said by an event, at the time of the closed form; steps of fixed length end there too."""
     stop, ts = 2.0 / (0.3 * G), jnp.asarray([0.0, 0.5, 2.0])
     q0, v0 = scenes.sliding_block.start(velocity=2.0)
-    for steps in ({"rtol": 1e-11, "atol": 1e-11}, {"stepsize": 0.1}):
-        solution = simulate(scenes.sliding_block(mass=1.7), q0, v0, ts, **steps)
+    for steps in (Steps(rtol=1e-11, atol=1e-11), 0.1):
+        solution = simulate(scenes.sliding_block(mass=1.7), q0, v0, ts, stepsize=steps)
         assert bool(solution.success) and list(solution.events.name[:2]) == ["friction: stick", ""]
         assert_close(solution.events.time[0], stop, 1e-12)
         assert_close(solution.q[1:, 0], [1.0 - 0.15 * G * 0.25, 2.0**2 / (0.6 * G)], 1e-12)
@@ -445,8 +452,8 @@ def test_a_block_that_has_stopped_gains_no_energy():
     scene, (q0, v0) = one_way_block(1.0, 1), scenes.sliding_block.start(velocity=2.0)
     ts = jnp.asarray([0.0, 3 * stop])
     with pytest.raises(RuntimeError, match=r"jd\.contact\.DryFriction"):
-        simulate(scene, q0, v0, ts, max_steps=500)
-    solution = simulate(scene, q0, v0, ts, throw=False, max_steps=500)
+        simulate(scene, q0, v0, ts, stepsize=jd.simulation.Steps(max_steps=500))
+    solution = simulate(scene, q0, v0, ts, throw=False, stepsize=jd.simulation.Steps(max_steps=500))
     assert not bool(solution.success) and abs(float(solution.stats["time_reached"]) - stop) < 1e-3
     solution = simulate(scene, q0, v0, ts, stepsize=h, throw=False)
     assert abs(float(solution.v[-1, 0])) < 0.3 * G * h and abs(float(solution.q[-1, 0]) - 4 / (0.6 * G)) < 2 * h
