@@ -13,15 +13,15 @@ modules.
 """
 
 from jaxdyn.compile.batch import sweep as sweep
+from jaxdyn.compile.executables import entry_point as entry_point
+from jaxdyn.compile.executables import jit as jit
 from jaxdyn.compile.first_calls import wait_for_code as wait_for_code
 from jaxdyn.compile.jacobi import gram_eigenvectors as gram_eigenvectors
 from jaxdyn.compile.jacobi import inverse as inverse
 from jaxdyn.compile.jacobi import pseudo_inverse_by_pivots as pseudo_inverse_by_pivots
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
 from jaxdyn.compile.kernels import Evaluation as Evaluation
-from jaxdyn.compile.kernels import entry_point as entry_point
 from jaxdyn.compile.kernels import evaluate as evaluate
-from jaxdyn.compile.kernels import jit as jit
 from jaxdyn.compile.kernels import kernel as kernel
 from jaxdyn.compile.kernels import run_trial as _run_trial  # noqa: F401 (it registers itself)
 from jaxdyn.compile.kernels import variant as variant

@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxdyn.compile import compilation
-from jaxdyn.compile.kernels import function_of, glue_options
+from jaxdyn.compile.executables import glue_options
+from jaxdyn.compile.jax_adapter import function_of
 from jaxdyn.model.arguments import as_array
 from jaxdyn.model.numbers import check_count, check_seed
 

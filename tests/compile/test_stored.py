@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.compile import disk, entry_point, jax_adapter, kernels, stored, target, trace
+from jaxdyn.compile import disk, entry_point, executables, jax_adapter, stored, target, trace
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.disk import NoFingerprint, fingerprint
 from jaxdyn.compile.expansion import expand
@@ -107,7 +107,7 @@ def folder(tmp_path):
 
 def forget():
     """Forget what this process has compiled, as a new one."""
-    kernels._find.cache_clear()
+    executables._find.cache_clear()
     trace._trace_program.cache_clear()
 
 
@@ -117,8 +117,8 @@ accelerate = entry_point(jd.constrained_dynamics)
 @pytest.mark.long
 def test_an_entry_point_is_found_again(folder, monkeypatch):
     scene, (q, v) = jd.scenes.four_bar(), jd.scenes.four_bar.start()
-    saved, made = [], kernels._save_executable
-    monkeypatch.setattr(kernels, "_save_executable", lambda *args: saved.append(args) or made(*args))
+    saved, made = [], executables._save_executable
+    monkeypatch.setattr(executables, "_save_executable", lambda *args: saved.append(args) or made(*args))
     first = accelerate(scene, q, v)
     (path,) = folder.glob("*.executable")
     forget()
@@ -262,8 +262,8 @@ GAIN = 2.0
 
 
 def test_functions_of_users_are_found_by_their_program(folder, monkeypatch):
-    saved, made = [], kernels._save_executable
-    monkeypatch.setattr(kernels, "_save_executable", lambda *args: saved.append(args) or made(*args))
+    saved, made = [], executables._save_executable
+    monkeypatch.setattr(executables, "_save_executable", lambda *args: saved.append(args) or made(*args))
     scene, (q, v) = jd.scenes.four_bar(), jd.scenes.four_bar.start()
 
     def energy(scene, q, v, *, offset=None):
@@ -271,7 +271,7 @@ def test_functions_of_users_are_found_by_their_program(folder, monkeypatch):
         return {"power": GAIN * acceleration @ v + (0.0 if offset is None else offset), "law": Law}
 
     def run(*args, **kwargs):
-        kernels._find.cache_clear()
+        executables._find.cache_clear()
         return jd.jit(energy)(*args, **kwargs)
 
     first = run(scene, q, v)

@@ -12,6 +12,7 @@ from benchmarks.extreme_motions import SOLVERS, run_oscillator, stability_limits
 from jaxdyn import robots, scenes
 from jaxdyn.constraints.codes import code_of
 from jaxdyn.reports import references
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 
 CASES = extremes.load()
@@ -166,7 +167,7 @@ def test_motion_passes_singular_positions_at_any_tolerance():
     @jax.vmap
     def run(tolerance):
         computed = simulate(
-            scene, q, v, ts, stepsize=jd.simulation.Steps(rtol=tolerance, atol=tolerance, max_steps=4096), throw=False
+            scene, q, v, ts, stepsize=Steps(rtol=tolerance, atol=tolerance, max_steps=4096), throw=False
         )
         return computed.q, computed.success, computed.stats["num_steps"]
 
@@ -190,7 +191,7 @@ def test_motions_through_many_singular_positions():
 
     def run(q, v, tolerance):
         computed = simulate(
-            scene, q, v, ts, stepsize=jd.simulation.Steps(rtol=tolerance, atol=tolerance, max_steps=2048), throw=False
+            scene, q, v, ts, stepsize=Steps(rtol=tolerance, atol=tolerance, max_steps=2048), throw=False
         )
         return computed.q, computed.success
 

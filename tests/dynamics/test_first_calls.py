@@ -8,7 +8,7 @@ from jax import monitoring
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
-from jaxdyn.compile import kernels, objects
+from jaxdyn.compile import executables, objects
 
 pytestmark = pytest.mark.native
 
@@ -18,9 +18,9 @@ def options(name):
 
     def in_force(monkeypatch):
         monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", name)
-        kernels.quick_options.cache_clear()
+        executables.quick_options.cache_clear()
         yield
-        kernels.quick_options.cache_clear()
+        executables.quick_options.cache_clear()
 
     return pytest.fixture(in_force, name=name)
 
@@ -59,7 +59,7 @@ def test_an_error_of_llvm_is_told_to_who_calls(monkeypatch):
 
 
 def test_the_environment_turns_the_options_off(usual):
-    assert kernels.quick_options() is None
+    assert executables.quick_options() is None
 
 
 def test_both_ways_agree(request):
@@ -90,7 +90,7 @@ def test_the_least_optimisation_gives_other_code_and_the_same_numbers(request):
     request.getfixturevalue("least")
     np.testing.assert_allclose(torque(2.0), 2 * one, rtol=1e-14)
     assert objects.name_of_file("a program") != key
-    options = kernels.quick_options()
+    options = executables.quick_options()
     assert options is not None and options["xla_backend_optimization_level"] == 0
 
 
@@ -129,7 +129,7 @@ def programs():
         if event.endswith("backend_compile_duration"):
             names.append(of.get("fun_name"))
 
-    kernels.quick_options()
+    executables.quick_options()
     monitoring.register_event_duration_secs_listener(seen)
     yield names
     monitoring.unregister_event_duration_listener(seen)

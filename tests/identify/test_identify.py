@@ -25,6 +25,7 @@ from jaxdyn.identify.regression import condense
 from jaxdyn.identify.robot_logs import RobotLogs, scene_with_parameters
 from jaxdyn.io import load_model
 from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene
 
@@ -563,9 +564,7 @@ def simulated_log(model, seed=0, noise=0.0):
     phase = jnp.arange(model.nv, dtype=float)[None]
     tau = 2 * jnp.sin((3 + 2 * phase) * t[:, None] + phase)
     start = 0.3 * jnp.ones(model.nv), jnp.zeros(model.nv)
-    motion = simulate(
-        model, *start, t, control=identify.SampledTorque(t, tau), stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12)
-    )
+    motion = simulate(model, *start, t, control=identify.SampledTorque(t, tau), stepsize=Steps(rtol=1e-12, atol=1e-12))
     measured = np.random.default_rng(seed).normal(scale=noise, size=(2, 101, model.nv))
     return identify.Log(t, motion.q + measured[0], motion.v + measured[1], None, tau)
 

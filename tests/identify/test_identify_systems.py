@@ -15,6 +15,7 @@ from jaxdyn.forces.elements import JointDamping
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size
 from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
@@ -33,7 +34,7 @@ def log_of(scene, q0, v0, t, tau, noise=0.0):
         v0,
         t,
         control=control,
-        stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12),
+        stepsize=Steps(rtol=1e-12, atol=1e-12),
         outputs=("acceleration",),
     )
     q, v, a = (np.asarray(x) for x in (motion.q, motion.v, motion.acceleration))
@@ -380,7 +381,7 @@ def test_trajectories_on_constraints():
     t = jnp.linspace(0, 1, 21)
     rod = scenes.pendulum_in_plane()
     held = Scene(rod.system, rod.constraints, (JointDamping(0.3),))
-    motion = simulate(held, *scenes.pendulum_in_plane.start(), t, stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12))
+    motion = simulate(held, *scenes.pendulum_in_plane.start(), t, stepsize=Steps(rtol=1e-12, atol=1e-12))
     log = identify.Log(t, motion.q, motion.v, None, jnp.zeros((21, 2)))
     chosen = lambda scene: [scene.system.parameters["gravity"], scene.forces[0].coefficient]  # noqa: E731
     wrong = eqx.tree_at(chosen, held, [jnp.asarray(7.0), jnp.asarray(0.1)])
