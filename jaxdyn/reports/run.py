@@ -24,7 +24,7 @@ from jaxdyn.reports.plotting import new_figure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Case, Prepared, case_of_scene, prepare
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.methods import Method
-from jaxdyn.simulation.solvers.explicit import keeps_fsal
+from jaxdyn.simulation.solvers.steps import keeps_fsal
 from jaxdyn.systems.scene import Scene
 
 

@@ -17,7 +17,7 @@ from jaxdyn.simulation.equations import KEPT, WITHIN, Equations
 from jaxdyn.simulation.methods import Reduced, is_regular
 from jaxdyn.simulation.options import Options, is_step_length
 from jaxdyn.simulation.solution import RESULTS, from_diffrax
-from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
+from jaxdyn.simulation.solvers import LibrarySteps, ProjectedSolver
 from jaxdyn.simulation.solvers.base import Adaptive, ErrorMonitoredSteps, Flag, StepOutput, Wrapped, too_coarse
 from jaxdyn.simulation.solvers.choice import (
     choose_loop,
@@ -26,9 +26,9 @@ from jaxdyn.simulation.solvers.choice import (
     solver_and_control,
 )
 from jaxdyn.simulation.solvers.driver import step_control
-from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS, delay
-from jaxdyn.simulation.solvers.integrator import ROOM, DiffraxRun, ExplicitRun, run, run_adaptively
+from jaxdyn.simulation.solvers.integrator import ROOM, DiffraxRun, LibraryRun, run, run_adaptively
+from jaxdyn.simulation.solvers.steps import Plan
 
 
 class Outcome(NamedTuple):
@@ -52,7 +52,7 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
     quality, guards = (None, None) if continuous else _monitors(eqs, method)
     loop, reason = choose_loop(solver, controller, options, guards, quality, eqs.pieces.names)
     if has_own_loop(solver) and not continuous:
-        solver = ExplicitSteps(solver, project, step_constants, method.projects, field=term.vector_field)
+        solver = LibrarySteps(solver, project, step_constants, method.projects, field=term.vector_field)
     elif project:
         solver = ProjectedSolver(solver, project, step_constants, method.projects)
     inputs = y0, args, ts
@@ -149,7 +149,7 @@ def _by_pieces(plan: Plan, eqs: Equations, inputs, controller, steps, options: O
     return Outcome(rows, end.result, end.counts, end.t)
 
 
-def _by_steps(solver: ExplicitSteps, plan: Plan, controller, inputs, steps, options: Options) -> Outcome:
+def _by_steps(solver: LibrarySteps, plan: Plan, controller, inputs, steps, options: Options) -> Outcome:
     """Integrate by explicit steps in the library's own loop."""
     # Attempts that locate the end do not count among the user's steps.
     most = options.max_steps + (0 if plan.guards is None else 2 * SEARCH_STEPS)
@@ -158,9 +158,9 @@ def _by_steps(solver: ExplicitSteps, plan: Plan, controller, inputs, steps, opti
             most if options.limit_is_given else min(most, ROOM),
             step_control(solver, None, controller.norm),
         )
-        run = ExplicitRun(plan, control, controller.rtol, controller.atol, None, most, room=room)
+        run = LibraryRun(plan, control, controller.rtol, controller.atol, None, most, room=room)
     else:
-        run = ExplicitRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], most, room=most)
+        run = LibraryRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], most, room=most)
     rows, (result, counts, reached) = (run.direct if _is_direct(options.adjoint) else run)(*inputs)
     if plan.guards is None:
         return Outcome(rows, result, counts, reached)

@@ -21,11 +21,11 @@ from jaxdyn.simulation.contact_steps import ContactStep, contact_step, mean_of_s
 from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.motion import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import may_have_redundant_rows
-from jaxdyn.simulation.solvers import ExplicitSteps
+from jaxdyn.simulation.solvers import LibrarySteps
 from jaxdyn.simulation.solvers.diffrax_methods import RK4
 from jaxdyn.simulation.solvers.driver import step_control
-from jaxdyn.simulation.solvers.explicit import take_step
-from jaxdyn.simulation.solvers.integrator import ExplicitRun
+from jaxdyn.simulation.solvers.integrator import LibraryRun
+from jaxdyn.simulation.solvers.steps import take_step
 from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike
 
@@ -169,7 +169,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
         return values_and_levels(lambda q, v, *own: guards(scene, q, v, t, tau if limits_vary else None, *own), *state)
 
     corrector = project if method.corrects(scene) else None
-    solver = ExplicitSteps(RK4(), corrector, method.step_constants, method.projects, field=field)
+    solver = LibrarySteps(RK4(), corrector, method.step_constants, method.projects, field=field)
     q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
     start = scene.drive_state(q, v)
     of_drives = () if start is None else (DRIVES,)
@@ -199,7 +199,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
                 flat = take_step(plan, args, start, end, flat, plan.first_rate(args, start, flat)).projected
             return state_of(plan.structure(flat), t + length)
         else:
-            run = ExplicitRun(plan, step_control(solver, size), None, None, size, substeps, room=substeps)
+            run = LibraryRun(plan, step_control(solver, size), None, None, size, substeps, room=substeps)
             rows, (result, *_) = (run.direct if is_direct else run)(y, args, ts)
         state = state_of(jax.tree.map(lambda x: x[0], rows), t + length)
         return (state, ContactStep({}, jnp.zeros_like(v), result, jnp.zeros((), v.dtype))) if report else state

@@ -12,7 +12,7 @@ from benchmarks.report_cases import cases, test_set
 from jaxdyn import scenes
 from jaxdyn.compile import loops
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.simulation.solvers.explicit import ExplicitSteps
+from jaxdyn.simulation.solvers.steps import LibrarySteps
 from jaxdyn.systems.scene import Scene
 
 pytestmark = pytest.mark.native
@@ -45,7 +45,7 @@ def test_steps_are_those_of_diffrax(solver, shape):
         return rows
 
     ours, theirs = (
-        quick(lambda: two_steps(ExplicitSteps(solver, field=field)))(),
+        quick(lambda: two_steps(LibrarySteps(solver, field=field)))(),
         quick(lambda: two_steps(solver))(),
     )
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-13), ours, theirs)

@@ -23,7 +23,7 @@ from jaxdyn.simulation import Pose, integration
 from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS
-from jaxdyn.simulation.solvers import RK4, ExplicitSteps, LieGroup, ProjectedSolver
+from jaxdyn.simulation.solvers import RK4, LibrarySteps, LieGroup, ProjectedSolver
 from jaxdyn.systems.scene import Scene
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
@@ -117,9 +117,9 @@ def test_only_models_with_quaternions_are_retracted(pendulum, leg, monkeypatch):
 
     def made(solver, project, *more, **fields):
         wrapped.extend([] if project is None else [project])
-        return ExplicitSteps(solver, project, *more, **fields)
+        return LibrarySteps(solver, project, *more, **fields)
 
-    monkeypatch.setattr(integration, "ExplicitSteps", made)
+    monkeypatch.setattr(integration, "LibrarySteps", made)
     for model, size in ((pendulum, 0), (leg, 1)):
         q0, v0 = neutral(model), jnp.zeros(model.nv)
         jax.make_jaxpr(lambda q, v, model=model: simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)

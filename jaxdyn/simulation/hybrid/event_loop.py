@@ -33,9 +33,9 @@ from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
 from jaxdyn.simulation.solvers import driver
 from jaxdyn.simulation.solvers.driver import step_control
-from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.guards import delay
-from jaxdyn.simulation.solvers.integrator import ExplicitRun, Integrator, zeros_or
+from jaxdyn.simulation.solvers.integrator import Integrator, LibraryRun, zeros_or
+from jaxdyn.simulation.solvers.steps import Plan
 
 
 class Records(NamedTuple):
@@ -299,7 +299,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     known_times = jnp.concatenate([ts[1:], jnp.where(happened, records.time[:most], jnp.inf)])
     is_event = jnp.arange(saves + most) >= saves
     order = jnp.lexsort((is_event, lax.stop_gradient(known_times)))  # a save point at an event is before it
-    part_run = ExplicitRun(
+    part_run = LibraryRun(
         plan, step_control(plan.solver(), run.stepsize), run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room
     )
     last = lax.stop_gradient(end.t)

@@ -41,9 +41,9 @@ from jaxdyn.simulation.hybrid.transitions import Transition, length, project
 from jaxdyn.simulation.methods import consistent, satisfies_redundant_rows
 from jaxdyn.simulation.solution import Solution, invalidate_failures, rows_where
 from jaxdyn.simulation.solvers.choice import label
-from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS
 from jaxdyn.simulation.solvers.integrator import ROOM
+from jaxdyn.simulation.solvers.steps import Plan
 from jaxdyn.systems.scene import Scene, check_callback, check_force
 
 

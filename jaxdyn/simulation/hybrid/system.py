@@ -48,7 +48,7 @@ from jaxdyn.simulation.hybrid.transitions import (
     search_mode,
     with_excess,
 )
-from jaxdyn.simulation.solvers.explicit import Plan
+from jaxdyn.simulation.solvers.steps import Plan
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
 

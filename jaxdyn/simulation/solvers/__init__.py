@@ -5,11 +5,11 @@ from jaxdyn.simulation.solvers.diffrax_methods import RK4 as RK4
 from jaxdyn.simulation.solvers.diffrax_methods import LieGroup as LieGroup
 from jaxdyn.simulation.solvers.diffrax_methods import Rodas5P as Rodas5P
 from jaxdyn.simulation.solvers.diffrax_methods import Stepper as Stepper
-from jaxdyn.simulation.solvers.explicit import ExplicitSteps as ExplicitSteps
+from jaxdyn.simulation.solvers.steps import LibrarySteps as LibrarySteps
 
 __all__ = [
     "RK4",
-    "ExplicitSteps",
+    "LibrarySteps",
     "LieGroup",
     "ProjectedSolver",
     "Rodas5P",

@@ -30,8 +30,8 @@ from jaxdyn.simulation.solvers.base import (
     no_sums,
     too_coarse,
 )
-from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
 from jaxdyn.simulation.solvers.guards import Point, Search, look_within, search_root
+from jaxdyn.simulation.solvers.steps import Plan, Step, dense_output, take_step
 
 # Floating-point numbers before the end of a run from which a step goes to the end: what is left is rounding, and a step of its
 # own for it would be shorter than the least one.

@@ -22,8 +22,8 @@ from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.simulation.solvers import driver, reverse
 from jaxdyn.simulation.solvers.choice import innermost
 from jaxdyn.simulation.solvers.driver import AdaptiveSteps, FixedSteps
-from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.guards import delay
+from jaxdyn.simulation.solvers.steps import Plan
 
 FORWARD = (
     'forward mode (jax.jvp, jax.jacfwd) through a run or a step needs adjoint="forward", of jd.simulate or jd.stepper'
@@ -125,7 +125,7 @@ def _(primals, tangents):
     return _pull(*primals), change
 
 
-class ExplicitRun(Integrator):
+class LibraryRun(Integrator):
     """Integrator by explicit steps: call(y0, args, ts) -> rows of the state at ts[1:]; result, counts, and the time reached.
 
     A plan with guards has a further row, that of the state at the time reached.

@@ -1,4 +1,4 @@
-"""Steps of explicit Runge-Kutta methods on one flat state, with a projection inside the step.
+"""Steps of explicit Runge-Kutta methods and of `Rodas5P` on one flat state, with a projection inside the step.
 
 A step is one kernel (`jaxdyn.compile`) where all of it is a scalar program, the projection included. What is not valid for a
 sample in it, for example an acceleration at rows that are close to dependent, has a second program. Elsewhere, and for
@@ -41,8 +41,8 @@ class _Interpolation(DenseOutput):
         return ravel_pytree(self.y0)[1](self.inner.evaluate(t))
 
 
-class ExplicitSteps(ProjectedSolver):
-    """The steps of an explicit Runge-Kutta method of diffrax, equal to diffrax's up to rounding.
+class LibrarySteps(ProjectedSolver):
+    """The steps of an explicit Runge-Kutta method of diffrax, equal to diffrax's up to rounding, or of `Rodas5P`.
 
     In a first-same-as-last method the projection acts before the last stage, so that the next step can reuse it
     (`ProjectedSolver` computes it again). That is possible where the error estimate does not need the last stage, because the
@@ -292,5 +292,5 @@ def _with_projected_end(plan: Plan, args, t1, raw, error, k):
 
 
 def keeps_fsal(tableau, step_constants: tuple[str, ...], branching: bool) -> bool:
-    """True if a first-same-as-last method stays one when its steps are projected: see `ExplicitSteps`."""
+    """True if a first-same-as-last method stays one when its steps are projected: see `LibrarySteps`."""
     return tableau.fsal and not step_constants and bool(tableau.b_error[-1] == 0 or not branching)
