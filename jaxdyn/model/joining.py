@@ -47,6 +47,7 @@ def join(
     for argument, model in (("left", left), ("right", right)):
         if not isinstance(model, Model):
             raise ValueError(f"{argument} is a {type(model).__name__}; pass a Model")
+        _check_is_tree(model)
     prefixes = ("", prefix) if isinstance(prefix, str) else prefix
     if not isinstance(prefixes, (tuple, list)) or len(prefixes) != 2 or not all(isinstance(x, str) for x in prefixes):
         raise ValueError(f"prefix is {prefix!r}; give a string for the right model, or one for each")
@@ -92,13 +93,17 @@ def join_all(models: Sequence[Model], name: str) -> Model:
 
     **Raises:** ValueError for names that two of them share, and, on concrete numbers, for different gravities.
     """
+    for model in models:
+        _check_is_tree(model)
     return _side_by_side(models, name, "join them by jd.join(..., prefix=)", by_name=True)
 
 
+def _check_is_tree(model: Model) -> None:
+    if model.nq > model.topology.nq:
+        raise ValueError(f"model {model.name!r} is a {type(model).__name__}; join its component models first")
+
+
 def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -> Model:
-    for model in models:
-        if model.nq > model.topology.nq:
-            raise ValueError(f"model {model.name!r} is a {type(model).__name__}; join its component models first")
     tops = [model.topology for model in models]
     for what in ("joint_names", "frame_names"):
         names = [n for top in tops for n in getattr(top, what)]

@@ -190,7 +190,9 @@ def test_refusals_and_codes():
         solve(scene, q, v, [0.0, 0.0], motors=[0, 0])
     with pytest.raises(ValueError, match=r"a_independent has shape \(2,\), expected \(1,\)"):
         solve(scene, q, v, [0.0, 1.0], motors=[0])
-    with pytest.raises(ValueError, match=r"v has shape \(2,\), expected \(3,\) = \(nv,\) or \(1,\)"):
+    with pytest.raises(
+        ValueError, match=r"v has shape \(2,\), expected \(3,\) or \(1,\), all velocities or the independent ones"
+    ):
         solve(scene, q, v[:2], [0.0], motors=[0])
     with pytest.raises(ValueError, match=r"weights is \[-1.\]; give positive numbers"):
         solve(scene, q, v, [0.0], motors=[0], weights=[-1.0])
