@@ -25,6 +25,9 @@ ARM = jd.robots.ur5()
 RNG = np.random.default_rng(0)
 
 
+FIND_DRIVER = device.driver.__wrapped__  # the fixture puts a stand-in in its place
+
+
 @pytest.fixture(scope="module")
 def of_process():
     """XLA calls kernels for GPUs on the CPU, by a driver that is none."""
@@ -336,7 +339,7 @@ def test_a_driver_that_fails_at_its_start_is_unsupported_by_name(name, monkeypat
     stand_in.fails = name
     monkeypatch.setattr(device, "open_library", lambda: stand_in)
     with pytest.raises(jax_adapter.Unsupported, match=f"^{name} of CUDA's driver failed"):
-        device.driver.__wrapped__()
+        FIND_DRIVER()
 
 
 def test_a_driver_without_a_function_is_unsupported():
@@ -380,7 +383,7 @@ def test_old_drivers_and_devices_are_unsupported(options, message):
 
 
 def test_without_a_driver_functions_run_on_jax_after_one_warning(caplog, monkeypatch):
-    monkeypatch.setattr(device, "driver", device.driver.__wrapped__)
+    monkeypatch.setattr(device, "driver", FIND_DRIVER)
     monkeypatch.setattr(device, "open_library", refuse)
     monkeypatch.setattr(device, "register", device.register.__wrapped__)
     monkeypatch.setattr(mode, "_said", set())

@@ -140,7 +140,7 @@ CASES = {
     "singular positions": singular,
     "projection": projection,
     "rows of a held quadruped": held_quadruped,
-    "adaptive steps of a held quadruped": lambda: held_quadruped(rtol=1e-6),
+    "adaptive steps of a held quadruped": lambda: held_quadruped(stepsize=jd.simulation.Steps(rtol=1e-6)),
     "fixed steps of an arm": lambda: steps_of_arm(stepsize=1e-2),
     "reverse mode of these": lambda: of_end(*steps_of_arm(stepsize=1e-2)),
     "adaptive steps to a joint's limit": lambda: steps_of_arm(events=(jd.events.JointLimit(),)),
