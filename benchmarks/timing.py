@@ -4,6 +4,7 @@ import json
 import time
 from pathlib import Path
 
+from jaxdyn.reports import run
 from jaxdyn.reports.run import time_interleaved as time_interleaved
 
 OUT = Path(__file__).resolve().parent.parent / "out"
@@ -26,7 +27,7 @@ def chosen_names(given, known) -> list[str]:
 
 def machine() -> dict:
     """Processor, cores and versions, for the head of a report."""
-    return timing.machine(("pin", "frax", "mujoco", "mujoco-mjx"))
+    return run.machine(("pin", "frax", "mujoco", "mujoco-mjx"))
 
 
 def write(name: str, report: dict) -> Path:
