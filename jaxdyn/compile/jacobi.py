@@ -29,7 +29,8 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 # Sweeps converge quadratically: six to ten are enough. The bound ends those over numbers that are not finite, for which the
 # test of convergence never holds.
 MAX_SWEEPS = 60
-# Share of a diagonal entry that elimination without exchange of rows has to leave as a pivot.
+# Share of a diagonal entry that elimination without exchange of rows has to leave as a pivot, and relative error of its inverse
+# from which on samples are computed with exchanges.
 _LEAST_SHARE = 1e-4
 
 
@@ -231,12 +232,16 @@ def _inverse_jvp(primals, tangents):
 
 
 def _inverse_without_exchange(matrix):
-    """The inverse; samples are invalid where a pivot is what a cancellation of four digits leaves."""
-    unit, tiny = jnp.eye(len(matrix), dtype=matrix.dtype), float(jnp.finfo(matrix.dtype).tiny)
-    result, pivots = eliminate(matrix, unit, tiny)
+    """The inverse; samples are invalid where a pivot is small beside its terms, or the inverse of a product is not its factor."""
+    n, tiny = len(matrix), float(jnp.finfo(matrix.dtype).tiny)
+    result, pivots = eliminate(matrix, jnp.eye(n, dtype=matrix.dtype), tiny)
     diagonal = jnp.diagonal(matrix)
     sizes = jnp.maximum(jnp.abs(diagonal), jnp.abs(diagonal - pivots))
-    return mark_invalid(~jnp.all(jnp.abs(pivots) > _LEAST_SHARE * sizes), result)
+    # Different entries, so that a symmetric mechanism hides nothing.
+    factor = jnp.linspace(1.0, 2.0, n, dtype=matrix.dtype)
+    off = jnp.matmul(result, jnp.matmul(matrix, factor, precision="highest"), precision="highest") - factor
+    is_good = jnp.all(jnp.abs(pivots) > _LEAST_SHARE * sizes) & jnp.all(jnp.abs(off) < _LEAST_SHARE)
+    return mark_invalid(~is_good, result)
 
 
 @variant(_inverse_without_exchange, marks=True)
