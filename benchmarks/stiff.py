@@ -275,7 +275,12 @@ def table(case: Case) -> str:
         f"**{case.name}.** {case.text} (over {case.ts[-1]:g} s). Reference: {kind}; two methods at 1e-10 differ by "
     ]
     lines[0] += f"{differ[0]:.0e}, in the derivative by {differ[1]:.0e}."
-    lines += ["", f"| {case.name.replace('_', ' ')}, {case.unit} | " + " | ".join(f"{k:.0e}" for k in case.values) + " | derivative |"]
+    lines += [
+        "",
+        f"| {case.name.replace('_', ' ')}, {case.unit} | "
+        + " | ".join(f"{k:.0e}" for k in case.values)
+        + " | derivative |",
+    ]
     lines += ["|---" * (case.values.size + 2) + "|"]
     rates = [jd.stiffness(scene, q0, v0, 0.0, control) for scene, control, q0, v0 in map(case.build, case.values)]
     for name in ("decay", "frequency"):

@@ -184,8 +184,6 @@ _C[7, :7] = (
     *(-40.06618937091002, -54.66780262877968, -9.48861652309627),
 )
 _TIME = np.array([0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1, 1, 1])
-# What jumps where steps end is constant within them: the limits from after at the start, and from before at the end.
-_SIDE = (_TIME == 0).astype(float) - (_TIME == 1)
 _RATE = np.zeros(8)
 _RATE[:5] = _GAMMA, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069
 # Dense output: y0 (1 - x) + x (y1 + (1 - x) (K[0] + x (K[1] + x K[2]))), K = H U.
@@ -256,7 +254,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         start, unravel = ravel_pytree(y0)
         control = terms.contr(t0, t1)
 
-        def change(y, t, _):
+        def change(y, t):
             return ravel_pytree(terms.vf_prod(t, unravel(y), args, control))[0]
 
         end, error, k = self.advance(change, start, t0, t1)
@@ -267,31 +265,31 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
     def advance(change: Callable, start: Array, t0: Number, t1: Number) -> tuple[Array, Array, Array]:
         """End (n,) of a step from a flat state, its error (n,), and the data (3, n) of its dense output.
 
-        `change(y, t, side)` (n,) is h f at a time t; `side` is 1 at the start of the step, -1 at its end, else 0.
+        `change(y, t)` (n,) is h f.
         """
         h = t1 - t0
 
-        def of_point(point, side):
-            return change(point[:-1], point[-1], side)
+        def of_point(point):
+            return change(point[:-1], point[-1])
 
         # One Jacobian with respect to (y, t): its last column is h df/dt.
         begin = jnp.append(start, jnp.asarray(t0, start.dtype))
-        jacobian = jax.jacfwd(of_point)(begin, jnp.ones((), start.dtype))
+        jacobian = jax.jacfwd(of_point)(begin)
         # `change` is h f, so that its Jacobian includes h.
         matrix = jnp.eye(start.size, dtype=start.dtype) - _GAMMA * jacobian[:, :-1]
         inverted = inverse(matrix)
 
         def stage(stages, row):
-            i, a, c, time, side, rate = row
+            i, a, c, time, rate = row
             point = jnp.append(start + matmul(a, stages), jnp.asarray(t0 + time * h, start.dtype))
-            right = _GAMMA * (of_point(point, side) + matmul(c, stages) + rate * h * jacobian[:, -1])
+            right = _GAMMA * (of_point(point) + matmul(c, stages) + rate * h * jacobian[:, -1])
             solution = matmul(inverted, right)
             # Products with an inverse lose the digits of the condition number; one refinement restores those of elimination.
             solution = solution + matmul(inverted, right - matmul(matrix, solution))
             return stages.at[i].set(solution), None
 
         # A scan rather than eight copies of the vector field: the program of a stage is compiled once.
-        rows = [jnp.asarray(x, start.dtype) for x in (_A, _C, _TIME, _SIDE, _RATE)]
+        rows = [jnp.asarray(x, start.dtype) for x in (_A, _C, _TIME, _RATE)]
         stages, _ = jax.lax.scan(stage, jnp.zeros((8, start.size), start.dtype), (jnp.arange(8), *rows))
         end = start + matmul(rows[0][-1], stages) + stages[-1]
         return end, stages[-1], matmul(jnp.asarray(_H, start.dtype), stages)

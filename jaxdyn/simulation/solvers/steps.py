@@ -181,13 +181,13 @@ class Plan(NamedTuple):
 
     def stage(self, args, t0, t1, y, c, side):
         """Step length times the vector field, at one of the `times` and from one of the `sides`."""
-        return self.change(args, t0, t1, y, jnp.where(c == 1, t1, t0 + c * (t1 - t0)), side)
-
-    def change(self, args, t0, t1, y, t, side):
-        """Step length times the vector field at a time within the step, from one of the `sides`."""
         # By more than the rounding of ends of steps and of times of samples, which are seldom computed alike.
         away = 4 * jnp.finfo(jnp.result_type(t0, t1)).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-        t = t + lax.stop_gradient(side * jnp.sign(t1 - t0) * away)
+        t = jnp.where(c == 1, t1, t0 + c * (t1 - t0)) + lax.stop_gradient(side * jnp.sign(t1 - t0) * away)
+        return self.change(args, t0, t1, y, t)
+
+    def change(self, args, t0, t1, y, t):
+        """Step length times the vector field at a time within the step."""
         return jnp.asarray(t1 - t0, y.dtype) * self.field_of(args, t, y)
 
     def project_end(self, args, t1, y, error):
@@ -253,6 +253,7 @@ def _stages(plan: Plan, args, t0, t1, start, first=None):
     none = jnp.zeros_like(start)
     if plan.tableau is None:
         method: Any = plan.solver
+        # At the times of the stages themselves: in stiff scenes a shift by their rounding is an error of the velocity.
         raw, error, k = method.advance(partial(plan.change, args, t0, t1), start, t0, t1)
         return _with_projected_end(plan, args, t1, raw, error, k)
     count = plan.count
