@@ -95,7 +95,6 @@ WAITING = {
     "identification.md": 3,
     "report.md": 1,
     "scale.md": 3,
-    "stiff.md": 4,
 }
 
 
