@@ -5,6 +5,7 @@ import contextlib
 import ctypes
 import hashlib
 import logging
+import math
 import os
 import re
 import threading
@@ -1049,3 +1050,50 @@ def test_inputs_that_are_not_read_are_not_passed():
         by_tree, by_x = jax.grad(lambda tree, x: run(tree, x).sum(), (0, 1))(tree, x)  # noqa: B023
         assert by_x.tolist() == [2.0, 3.0] and by_tree["read"].tolist() == [5.0, 7.0]
         assert by_tree["unread"].tolist() == [0.0] * 4
+
+
+def test_what_all_samples_share_is_read_once():
+    made = numbers_of(lambda x, y: x + jnp.sin(y), jnp.ones(()), jnp.ones(()))
+    one, each = (kernel_ir(made, 4, [False, same]) for same in (True, False))
+    assert one.count("load double") == 4 + 1 and "shufflevector" in one
+    assert each.count("load double") == 4 + 4 and "shufflevector" not in each
+    lowered = jax.jit(jax.vmap(native(lambda x, y: x + jnp.sin(y)), (0, None))).lower(jnp.ones(64), jnp.ones(()))
+    # Axes of length one may be added; nothing is copied for each sample.
+    copied = [line for line in lowered.as_text().splitlines() if "broadcast_in_dim" in line]
+    sizes = [
+        [math.prod(map(int, re.findall(r"(\d+)x", kind))) for kind in re.findall(r"tensor<([^>]*)>", x)] for x in copied
+    ]
+    assert all(before == after for before, after in sizes), copied
+
+
+def test_lanes_follow_the_batch_and_the_dtype():
+    made, short = (numbers_of(lambda x: x + 1, jnp.ones(2, dtype)) for dtype in FLOATS)
+    wide = target.vector_bytes() // 8
+    assert (target.width_of(made, 1), target.width_of(made, 9), target.width_of(short, 9)) == (1, wide, 2 * wide)
+
+
+def test_along_gives_the_value_and_its_change():
+    def function(a, b):
+        return a * b[0], b[1]
+
+    value, change = backend.value_and_jvp(function, (2.0, (3.0, 4.0)), [1.0, None, 5.0])
+    assert value == (6.0, 4.0) and change == (3.0, 5.0)
+    assert backend.value_and_jvp(function, (2.0, (3.0, 4.0)), [None, None, None]) == ((6.0, 4.0), None)
+
+
+def test_cleared_caches_of_jax_change_nothing():
+    run = jax.jit(native(jnp.sin))
+    before = run(jnp.ones(3))
+    jax.clear_caches()
+    np.testing.assert_array_equal(run(jnp.ones(3)), before)
+    np.testing.assert_array_equal(jax.jit(native(jnp.sin))(jnp.ones(3)), before)
+
+
+def test_the_folder_is_the_users_unless_set(monkeypatch, tmp_path):
+    before = disk._folder, disk._is_off
+    try:
+        disk.set_cache_folder(None)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        assert disk.cache_folder() == tmp_path / "jaxdyn" / "kernels"
+    finally:
+        disk._folder, disk._is_off = before
