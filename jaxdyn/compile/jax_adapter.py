@@ -2,9 +2,9 @@
 
 Names of JAX that are documented little, or that have changed, are used here alone; `tests/package/test_jax_adapter.py`
 lists them, with the page that documents each. The versions of `TESTED` are those that the tests run with. On any other
-version a trial goes through all rules before the first kernel, and where it fails there are no kernels in this process; an error
-while a function is expanded leaves that function to JAX's own operations. One warning names the version and the reason
-(`forgive`, `reason_against_kernels`).
+version a trial goes through all rules before the first kernel, and where it fails there are no kernels in this process; a later
+error while a function is compiled to a kernel leaves that function to JAX's own operations. One warning names the version and
+the reason (`forgive`, `reason_against_kernels`).
 """
 
 import contextlib
@@ -260,12 +260,17 @@ def is_all_manual(mesh) -> bool:
 
 def vary_alike(leaves: list) -> list:
     """The same arrays, each varying along all manual axes of meshes along which one of them does."""
-    types = [getattr(jax.typeof(x), "manual_axis_type", None) for x in leaves]
-    axes = frozenset().union(*(x.varying for x in types if x is not None))
-    return [
-        x if kind is None or axes <= kind.varying else lax.pcast(x, tuple(axes - kind.varying), to="varying")
-        for x, kind in zip(leaves, types, strict=True)
-    ]
+    try:
+        types = [getattr(jax.typeof(x), "manual_axis_type", None) for x in leaves]
+        axes = frozenset().union(*(x.varying for x in types if x is not None))
+        return [
+            x if kind is None or axes <= kind.varying else lax.pcast(x, tuple(axes - kind.varying), to="varying")
+            for x, kind in zip(leaves, types, strict=True)
+        ]
+    except Exception as error:
+        if not forgive(error):
+            raise
+        return leaves
 
 
 def sharding_attributes(batch_dims: int, sizes: Sequence[int], operands: Sequence, results: Sequence) -> dict:

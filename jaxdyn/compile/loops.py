@@ -22,7 +22,7 @@ from jaxdyn.compile import mode
 from jaxdyn.compile.batch import any_sample, while_loop
 from jaxdyn.compile.body import Body, bytes_of, copy_bytes
 from jaxdyn.compile.code import body_of, wrap_kernel
-from jaxdyn.compile.jax_adapter import vary_alike
+from jaxdyn.compile.jax_adapter import forgive, vary_alike
 from jaxdyn.compile.kernels import kernel
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.llvm import Emitter
@@ -96,7 +96,12 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> Carry:
     **Arguments:** `tree` as of `kernels.kernel`; `constants`, a pytree.
     """
     given, carry = jax.tree.map(jnp.asarray, (given, carry))
-    after = _run_natively(task, tree, constants, given, carry)
+    try:
+        after = _run_natively(task, tree, constants, given, carry)
+    except Exception as error:
+        if not forgive(error):
+            raise
+        after = None
     return _run_by_jax(task, tree, constants, given, carry) if after is None else after
 
 

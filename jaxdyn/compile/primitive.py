@@ -99,7 +99,10 @@ def _tangent_or_none(program, moving: tuple[bool, ...]) -> Program | None:
         if program.fallback is None:
             raise
         mode.say_without_kernel(f"the derivative of {program.name}", str(reason))
-        return None
+    except Exception as error:
+        if program.fallback is None or not jax_adapter.forgive(error):
+            raise
+    return None
 
 
 def _transpose_program(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
@@ -240,7 +243,16 @@ def _partition_attributes(avals: Sequence, results: Sequence) -> dict | None:
 def _lower_on_gpu(ctx, *operands, program, rows):
     if mode.current() != "native":  # until it has run on a device
         return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
-    return _lower_to_call(ctx, *operands, program=program, rows=rows, on_gpu=True)
+    return _lower_to_kernel(ctx, *operands, program=program, rows=rows, on_gpu=True)
+
+
+def _lower_to_kernel(ctx, *operands, program, rows, **place):
+    try:
+        return _lower_to_call(ctx, *operands, program=program, rows=rows, **place)
+    except Exception as error:
+        if not jax_adapter.forgive(error):
+            raise
+        return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
 
 
 def _lower_elsewhere(*args, program, rows):
@@ -331,7 +343,7 @@ kernel_p = define_primitive(
     multiple_results=True,
     implement=_implement,
     lower=_lower_elsewhere,
-    lower_on_cpu=_lower_to_call,
+    lower_on_cpu=_lower_to_kernel,
     lower_on_gpu=_lower_on_gpu,
     batch=_batch,
     jvp=_jvp,
