@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.compile import stored
-from jaxdyn.compile.graph import Graph, inline, repeat, replay
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import inline, repeat, replay
 from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program, is_number, objects
 
 

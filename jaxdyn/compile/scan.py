@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.compile import derive
-from jaxdyn.compile.graph import Graph, arrays_of, replay
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import arrays_of, replay
 from jaxdyn.compile.program import Array, Constant, Program, as_objects, is_number
 
 # Operations beyond which a loop is not written out. LLVM takes some 50 microseconds for each: one second.

@@ -18,7 +18,8 @@ from jaxdyn.compile import derive
 from jaxdyn.compile.body import Body, symbol_of
 from jaxdyn.compile.code import ATTRIBUTES
 from jaxdyn.compile.directions import Directions
-from jaxdyn.compile.graph import Graph, inline, replay
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.mode import careful, remedy_of, standalone
 from jaxdyn.compile.objects import features as host_features
