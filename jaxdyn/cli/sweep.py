@@ -175,7 +175,7 @@ def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
         given: dict[str, Any] = one if isinstance(one, dict) else {}
         # Exactly one distribution, since two of them would contradict each other.
         kinds = [kind for kind in _DRAWS if kind in given]
-        ends = given[kinds[0]] if len(kinds) == 1 else None
+        ends: Any = given[kinds[0]] if len(kinds) == 1 else ()
         numbers = isinstance(ends, list) and len(ends) == 2 and all(type(x) in (int, float) for x in ends)
         if not (numbers and np.all(np.isfinite(ends))):
             raise ValueError(
@@ -184,9 +184,9 @@ def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
         size = given.get("size", 1)
         if type(size) is not int or not 1 <= size < 2**31:
             raise ValueError(f"parameter {name}: size is {size!r}; give a whole number of at least 1")
-        if kinds[0] == "log_uniform" and not min(ends) > 0:  # pyright: ignore[reportArgumentType]
+        if kinds[0] == "log_uniform" and not min(ends) > 0:
             raise ValueError(f"parameter {name}: log_uniform = {ends}; give positive numbers")
-        drawn[name] = (kinds[0], float(ends[0]), float(ends[1]), (int(given["size"]),) if "size" in given else ())  # pyright: ignore[reportOptionalSubscript]
+        drawn[name] = (kinds[0], float(ends[0]), float(ends[1]), (int(given["size"]),) if "size" in given else ())
 
     def draw(key: Any) -> dict[str, Any]:
         keys = jax.random.split(key, max(1, len(drawn)))

@@ -332,7 +332,9 @@ def _broadcast_rows(*args, program, rows):
 def _call_in_two(*args, program, rows):
     """The call as two, the first of the numbers that all samples share."""
     uniform = [x.ndim == 1 for x in args]
-    once, each = split_program(program, uniform)  # pyright: ignore[reportGeneralTypeIssues]
+    parts = split_program(program, uniform)
+    assert parts is not None
+    once, each = parts
     shared = kernel_p.bind(*(x for x in args if x.ndim == 1), program=once, rows=0)
     return kernel_p.bind(*args, *shared, program=each, rows=rows)
 

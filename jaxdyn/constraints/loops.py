@@ -325,10 +325,10 @@ def model_couplings(model: Model) -> tuple[Gear, ...]:
     scene = jd.Scene(model, jd.constraints.model_couplings(model))
     ```
     """
-    names = model.joint_names
+    names, values = model.joint_names, () if model.coupling_values is None else model.coupling_values
     return tuple(
-        gear(names[joint], names[source], *(model.coupling_values[i]))  # pyright: ignore[reportOptionalSubscript]
-        for i, (joint, source) in enumerate(model.topology.couplings)
+        gear(names[joint], names[source], *value)
+        for (joint, source), value in zip(model.topology.couplings, values, strict=True)
     )
 
 

@@ -242,7 +242,8 @@ class RollingSphere(Touching):
             normal, gap = _unit(2, p), p[2] - radius
             directions = jnp.eye(2, 3, dtype=p.dtype)
         else:
-            reach = self.surface_radius.astype(p.dtype)  # pyright: ignore[reportOptionalMemberAccess]
+            assert self.surface_radius is not None
+            reach = self.surface_radius.astype(p.dtype)
             # From the centre of a sphere, from the axis of a cylinder.
             away = p if self.on == "sphere" else p * jnp.asarray([1.0, 1.0, 0.0], p.dtype)
             outward = unit_or(away, _unit(0, p))

@@ -326,7 +326,9 @@ def _width(cone: FrictionCone) -> int:
 
 def _stack(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
     total = sum(_width(cone) for cone in cones)
-    linear, second, normal, kept, place = [np.zeros((0, total))], [np.zeros((0, 3, total))], np.zeros(total), [], 0
+    linear: list[np.ndarray] = [np.zeros((0, total))]
+    second: list[np.ndarray] = [np.zeros((0, 3, total))]
+    normal, kept, place = np.zeros(total), [], 0
     for cone in cones:
         columns = slice(place, place + _width(cone))
         place = columns.stop
@@ -344,11 +346,11 @@ def _stack(cones: list[FrictionCone], faces: int | None, side: str) -> _Rows:
                 [rows[np.abs(rows[:, used]).sum(1) > 0], -np.eye(len(used))[-1 if cone.in_plane else 2][None]]
             )
             rows = rows[[np.abs(row[~used]).sum() == 0 for row in rows]]
-            cones_of = cones_of if float(cone.mu) > 0 else cones_of[:0]  # pyright: ignore[reportArgumentType]
-        linear.append(np.zeros((len(rows), total)))  # pyright: ignore[reportArgumentType]
+            cones_of = cones_of if cone.mu is not None and float(cone.mu) > 0 else cones_of[:0]
+        linear.append(np.zeros((len(rows), total)))
         linear[-1][:, columns] = rows
         if faces is None and len(cones_of):
-            second.append(np.zeros((len(cones_of), 3, total)))  # pyright: ignore[reportArgumentType]
+            second.append(np.zeros((len(cones_of), 3, total)))
             second[-1][:, :, columns] = cones_of
         if cone.rows is not None:
             normal[columns] = -rows.mean(0)

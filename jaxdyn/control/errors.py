@@ -116,7 +116,7 @@ class ConfigurationError(Constraint):
     """Displacement (nv,) from the target q_d(t) (nq,) to q, along the manifold of the system."""
 
     target: Callable
-    name: str = eqx.field(static=True, default="configuration")
+    name: str = eqx.field(static=True, default="configuration", kw_only=True)
 
     def position(self, system, q, t):
         """Displacement q - q_d; twists from the target for joints with rotations in space."""
@@ -129,7 +129,7 @@ class FrameError(Constraint):
     target: Callable
     frame: str = eqx.field(static=True)
     task: str = eqx.field(static=True)
-    name: str = eqx.field(static=True, default="frame")
+    name: str = eqx.field(static=True, default="frame", kw_only=True)
 
     def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, " m"]:
         """Error of position (3,), m, of orientation (3,), rad, or both."""
@@ -145,7 +145,7 @@ class CenterError(Constraint):
     """Error c(q) - c_d(t) of the centre of mass, (3,), m, in world axes."""
 
     target: Callable
-    name: str = eqx.field(static=True, default="center_of_mass")
+    name: str = eqx.field(static=True, default="center_of_mass", kw_only=True)
 
     def sizes(self, system, dtype):
         """Three rows."""
@@ -168,7 +168,7 @@ class TaskError(Constraint):
 
     task: Callable
     target: Callable
-    name: str = eqx.field(static=True, default="task")
+    name: str = eqx.field(static=True, default="task", kw_only=True)
 
     def position(self, system, q, t):
         """Error task(q) - target(t)."""
@@ -180,7 +180,7 @@ class RateError(Constraint):
 
     task: Callable
     target: Callable
-    name: str = eqx.field(static=True, default="rates")
+    name: str = eqx.field(static=True, default="rates", kw_only=True)
 
     def velocity(self, system, q, v, t):
         """Error task(q, v) - target(t)."""
@@ -194,7 +194,7 @@ def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:
     if not isinstance(model, Model):
         raise ValueError(f"model is a {type(model).__name__}, which has no named frames; pass a Model")
     frame_index(model, frame)
-    return FrameError(as_target(target), frame, task)  # pyright: ignore[reportCallIssue]
+    return FrameError(as_target(target), frame, task)
 
 
 def target_rows(system, error: Constraint, kp, kd, q, v, t) -> tuple[Float[Array, "m nv"], Float[Array, " m"]]:

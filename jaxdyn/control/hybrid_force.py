@@ -184,7 +184,7 @@ def _error(task: Any, target: Any, of: str, kd) -> Constraint:
             f"kd is {'None' if kd is None else 'given'} for a task of {of}; positions take kp and kd, velocities kp"
         )
     function = as_pytree(task, f"task (of {of})", "q" if of == "position" else "q, v")
-    return TaskError(function, as_target(target)) if of == "position" else RateError(function, as_target(target))  # pyright: ignore[reportCallIssue]
+    return TaskError(function, as_target(target)) if of == "position" else RateError(function, as_target(target))
 
 
 class GaugeInvariant(ForceLoop):
@@ -237,7 +237,7 @@ class GaugeInvariant(ForceLoop):
         ki: Numbers | None = None,
     ):
         self.scene = constrained(scene)
-        self.error = TaskError(as_pytree(task, "task", "q"), as_target(target))  # pyright: ignore[reportCallIssue]
+        self.error = TaskError(as_pytree(task, "task", "q"), as_target(target))
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
         self.force = None if force is None else as_target(force, "force")
         self.ki = None if ki is None else gain(ki, "ki")

@@ -224,7 +224,9 @@ def _limits(limits, us):
 
 
 def _clip(problem: _Problem, us, k: Any = slice(None)):
-    return us if problem.lower is None else jnp.clip(us, problem.lower[k], problem.upper[k])  # pyright: ignore[reportOptionalSubscript]
+    if problem.lower is None or problem.upper is None:
+        return us
+    return jnp.clip(us, problem.lower[k], problem.upper[k])
 
 
 def _solve(problem: _Problem, x0, xs, us, gains, damping, iterations: int, tol: float) -> _State:

@@ -56,7 +56,7 @@ class _HeldAtLimits(Constraint):
     active: Float[Array, " n"]  # -1 at the lower limit, 1 at the upper one
     limit: Float[Array, " n"]
     joints: tuple[int, ...] = eqx.field(static=True)
-    name: str = eqx.field(static=True, default="limits")
+    name: str = eqx.field(static=True, default="limits", kw_only=True)
 
     def sizes(self, system, dtype):
         """A row for each joint."""
@@ -284,7 +284,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
             return Scene(model, tuple(rows))
         limit = jnp.where(active < 0, lower, upper)
         at_limit = jnp.where(active != 0, limit, jnp.zeros_like(limit))
-        return Scene(model, (*rows, _HeldAtLimits(active, at_limit, joints)))  # pyright: ignore[reportCallIssue]
+        return Scene(model, (*rows, _HeldAtLimits(active, at_limit, joints)))
 
     def sides(below, above):
         return above.astype(q.dtype) - below.astype(q.dtype)

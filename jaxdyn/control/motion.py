@@ -78,7 +78,7 @@ class ComputedTorque(eqx.Module):
         """Joint torques (nv,), N m or N."""
         t = jnp.asarray(t, q.dtype)
         system = self.scene.system
-        error = ConfigurationError(self.target)  # pyright: ignore[reportCallIssue]
+        error = ConfigurationError(self.target)
         A, a = target_rows(system, error, self.kp, self.kd, q, v, t)
         # For v = dq/dt the rows are the unit matrix, and the right-hand side is the acceleration itself.
         if not has_coordinate_rates(system):

@@ -59,7 +59,7 @@ class ObjectError(Constraint):
 
     target: Callable
     grasp: Grasp
-    name: str = eqx.field(static=True, default="object")
+    name: str = eqx.field(static=True, default="object", kw_only=True)
 
     def position(self, system, q, t):
         """Displacement from the target to the object's configuration."""
@@ -130,7 +130,7 @@ class GraspForce(ForceIntegral):
     ):
         check_grasp(grasp)
         self.scene = grasp
-        self.error = ObjectError(as_target(target), grasp)  # pyright: ignore[reportCallIssue]
+        self.error = ObjectError(as_target(target), grasp)
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
         self.preload = as_target(preload, "preload")
         self.ki = None if ki is None else gain(ki, "ki")
@@ -298,7 +298,7 @@ class WholeBody(eqx.Module):
         self.feet, self.model = check_feet(model, contacts), model
         if not self.feet:
             raise ValueError("contacts is empty; without a foot on the ground nothing moves the centre of mass")
-        self.center = CenterError(as_target(com, "com"))  # pyright: ignore[reportCallIssue]
+        self.center = CenterError(as_target(com, "com"))
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
         self.turn, self.turn_gains = None, (self.kp, self.kd)
         if turn is not None:

@@ -111,8 +111,8 @@ def guards_by_force(scene: Scene, q, v, t, tau, state=None) -> list[tuple[Any, A
             own = jnp.asarray(force.guards(scene.system, q, v, t), q.dtype)
             if own.ndim != 1:
                 raise ValueError(f"{type(force).__name__}: guards gives shape {own.shape}; expected (n,)")
-        if tau is not None and hasattr(force, "effort_guards"):
-            efforts = force.effort_guards(scene.system, tau, v)  # pyright: ignore[reportAttributeAccessIssue]
+        if tau is not None and (effort_guards := getattr(force, "effort_guards", None)):
+            efforts = effort_guards(scene.system, tau, v)
         # Drives and limits act one after the other: the next one sees the clipped effort.
         if tau is not None:
             tau, _, state = pass_command(force, scene.system, q, v, t, tau, state)

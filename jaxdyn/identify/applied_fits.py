@@ -234,9 +234,11 @@ def _residuals(robot: RobotFit, loaded: Sequence[Log], own: slice, payload) -> t
         robot.fit,
         inertias.at[own.start // 10].add(jnp.asarray(payload, inertias.dtype)),
     )
-    return tuple(  # pyright: ignore[reportReturnType]
-        [fit.torques(log) - np.asarray(log.tau, np.float64) for log in loaded] for fit in (with_payload, robot.fit)
-    )
+
+    def errors(fit):
+        return [fit.torques(log) - np.asarray(log.tau, np.float64) for log in loaded]
+
+    return errors(with_payload), errors(robot.fit)
 
 
 def _errors(robot: RobotFit, loaded: Sequence[Log], own: slice, payload) -> tuple[float, float]:

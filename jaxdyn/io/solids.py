@@ -269,10 +269,11 @@ def check_choice(contacts: Any) -> str | tuple[str, ...] | dict[str, int] | None
         for name, lowest in contacts.items():
             check_count(lowest, f"contacts[{name!r}]")
         return dict(contacts)
-    names = tuple(contacts) if isinstance(contacts, Iterable) and not isinstance(contacts, str) else (None,)
-    if not all(isinstance(name, str) for name in names):
+    names = tuple(contacts) if isinstance(contacts, Iterable) and not isinstance(contacts, str) else (contacts,)
+    known = tuple(name for name in names if isinstance(name, str))
+    if known != names or isinstance(contacts, str):
         raise ValueError(f"contacts is {contacts!r}; give 'ground', a list of names of links that touch it, or None")
-    return names  # pyright: ignore[reportReturnType]
+    return known
 
 
 def contacts_with_ground(

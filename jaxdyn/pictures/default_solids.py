@@ -281,11 +281,11 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
             and np.linalg.norm(host_math.about_com(np.asarray(model.inertias, float)[body])[1] - centre) < radius
         ):
             bodies.add(body)
-        reach = getattr(constraint, "surface_radius", None)
-        if reach is not None and not constraint.inside:  # pyright: ignore[reportAttributeAccessIssue]
+        if isinstance(constraint, RollingSphere) and constraint.surface_radius is not None and not constraint.inside:
+            reach = constraint.surface_radius
             surface = np.asarray(constraint.surface, float)
             kind, size = ("ellipsoid", (float(reach),) * 3)
-            if constraint.on == "cylinder":  # pyright: ignore[reportAttributeAccessIssue]
+            if constraint.on == "cylinder":
                 kind, size = "cylinder", (float(reach), 4 * float(reach))
             shapes.append(Shape(constraint.surface_body, kind, size, surface, source="constraint"))
     return shapes, bodies

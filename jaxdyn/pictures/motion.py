@@ -153,8 +153,10 @@ def select_rows(ts: np.ndarray, most: int) -> np.ndarray:
 def _ends(motion: Motion, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     """Poses (n, nt, 4, 4) of the frames A and B of a constraint."""
     model = motion.scene.system
-    ends = pair.resolve(model).ends()
-    return tuple(frame_poses(model, motion.poses, body) @ np.asarray(pose, float) for body, pose in ends)  # pyright: ignore[reportReturnType]
+    a, b = (
+        frame_poses(model, motion.poses, body) @ np.asarray(pose, float) for body, pose in pair.resolve(model).ends()
+    )
+    return a, b
 
 
 def marks(motion: Motion) -> list[Mark]:
@@ -194,7 +196,8 @@ def _rows(motion: Motion, a: np.ndarray, b: np.ndarray) -> tuple[jax.Array, jax.
     """Rotations and positions of frame B in A, and configurations, of all rows of all trajectories."""
     transpose = np.swapaxes(a[..., :3, :3], -1, -2)
     R, p = transpose @ b[..., :3, :3], (transpose @ (b[..., :3, 3:] - a[..., :3, 3:]))[..., 0]
-    return tuple(jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in (R, p, motion.q))  # pyright: ignore[reportReturnType]
+    R, p, q = (jnp.asarray(x.reshape(-1, *x.shape[2:])) for x in (R, p, motion.q))
+    return R, p, q
 
 
 def forces(motion: Motion) -> list[Force]:

@@ -188,14 +188,16 @@ def _turns_freely(shape: Shape, model: Model) -> bool:
 def color_of(shape: Shape, model) -> tuple[float, float, float]:
     """Colour (3,) from 0 to 1 of a solid: its own, or that of its body."""
     if shape.color is not None:
-        return tuple(float(x) for x in shape.color[:3])  # pyright: ignore[reportReturnType]
+        red, green, blue = map(float, shape.color[:3])
+        return red, green, blue
     index = -1 if shape.frame is None else model.topology.frame_bodies[model.frame_names.index(shape.frame)]
     return (0.7, 0.7, 0.7) if index < 0 else rgb(_BODIES[index % len(_BODIES)])
 
 
 def rgb(code: str) -> tuple[float, float, float]:
     """Colour (3,) from 0 to 1 of a code #rrggbb."""
-    return tuple(int(code[k : k + 2], 16) / 255 for k in (1, 3, 5))  # pyright: ignore[reportReturnType]
+    red, green, blue = (int(code[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return red, green, blue
 
 
 def new_axes(ax) -> Any:
