@@ -204,7 +204,7 @@ def eliminate(rows: np.ndarray, count: int, ridge: np.ndarray) -> tuple[np.ndarr
 
 
 # Share of the variance above which the prior is the source of a number.
-_FROM_PRIOR = 0.5
+FROM_PRIOR = 0.5
 # Share of the variance of a number, due to extra terms, above which it is confounded with these.
 _FROM_EXTRA = 0.5
 CONFOUNDED, STILL, UNDETERMINED = "confounded", "hardly moved", "undetermined"
@@ -233,7 +233,7 @@ class Spread(NamedTuple):
           the variance of another number with it;
         - "hardly moved": friction or rotor inertia of a joint that stood nearly still in all logs.
         """
-        source = np.where(self.prior_share > _FROM_PRIOR, "prior", "data")
+        source = np.where(self.prior_share > FROM_PRIOR, "prior", "data")
         source = np.where(self.marks != "", self.marks, source)
         return np.where(np.isfinite(self.std) | (self.marks == UNDETERMINED), source, "bound").tolist()
 

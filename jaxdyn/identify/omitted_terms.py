@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.condensed_fit import Data, Estimate, Intervals, Setting, Spread, local_coordinates
-from jaxdyn.identify.uncertainty import block_groups, invert, student
+from jaxdyn.identify.condensed_fit import FROM_PRIOR, Data, Estimate, Intervals, Setting, Spread, local_coordinates
+from jaxdyn.identify.uncertainty import block_groups, invert, psd_root, student
 
 # Two-sided level at which a term is named: it is asked for every term at every joint.
 _LEVEL = 1e-2
@@ -27,8 +27,9 @@ _LEVEL = 1e-2
 class Shift(NamedTuple):
     """Effect of further terms: change of all parameters (p,), and a root (p, groups) of their covariance with them.
 
-    `terms`: names and indices of torques; `factor`: of a 95 % interval; `clearness`: largest coefficient over its standard
-    deviation; `least`: clearness from which on the terms are named.
+    The root has the scatter over groups, and the pull of the prior (n more columns). `terms`: names and indices of torques;
+    `factor`: of a 95 % interval; `clearness`: largest coefficient over its standard deviation, of those that the logs determine;
+    `least`: clearness from which on the terms are named.
     """
 
     terms: tuple[tuple[str, int], ...]
@@ -42,11 +43,13 @@ class Shift(NamedTuple):
 class _Extended(NamedTuple):
     """Fit with the columns of further terms, in coordinates of unit curvature.
 
-    `jacobian` (p, n): of all parameters, the fit's own coordinates first; `gradients` (groups, n) and `grams` (groups, n, n);
-    `curvatures` (1 + groups, n, n): with all groups, and without each of them; `inverses`: of their own parts.
+    `jacobian` (p, n): of all parameters, the fit's own coordinates first; `prior` (n, n): a root of its curvature; `gradients`
+    (groups, n) and `grams` (groups, n, n); `curvatures` (1 + groups, n, n): with all groups, and without each of them;
+    `inverses`: of their own parts.
     """
 
     jacobian: np.ndarray
+    prior: np.ndarray
     gradients: np.ndarray
     grams: np.ndarray
     curvatures: np.ndarray
@@ -54,7 +57,7 @@ class _Extended(NamedTuple):
 
     def extend(self, terms: tuple[tuple[str, int], ...], new: np.ndarray) -> Shift | None:
         """Shift by the coefficients `new`, None where independent errors alone explain them."""
-        T, g, G, curvatures, inverses = self
+        T, prior, g, G, curvatures, inverses = self
         own, groups = inverses.shape[1], len(G)
         kept, cross = np.append(np.arange(own), new), curvatures[:, :own, new]
         eliminated = inverses @ cross
@@ -70,8 +73,16 @@ class _Extended(NamedTuple):
         known = inverses[1:] @ right[:, :own]
         last = inverse[1:] @ (right[:, own:] - np.swapaxes(cross[1:], 1, 2) @ known)
         replicates = np.concatenate([known - eliminated[1:] @ last, last], axis=1)[..., 0]
-        root = (replicates - replicates.mean(axis=0)).T * np.sqrt((groups - 1) / groups)
-        clearness = float(np.max(np.abs(step[own:]) / np.maximum(np.linalg.norm(root[own:], axis=1), 1e-300)))
+        scatter = (replicates - replicates.mean(axis=0)).T * np.sqrt((groups - 1) / groups)
+        right = prior[np.ix_(kept, kept)]
+        known = inverses[0] @ right[:own]
+        last = inverse[0] @ (right[own:] - cross[0].T @ known)
+        pulled = np.concatenate([known - eliminated[0] @ last, last])
+        root = np.concatenate([scatter, pulled], axis=1)
+        # The first link's weight and a spring at its joint are one torque: only the prior tells them apart, and the logs do not.
+        sizes, by_prior = np.linalg.norm(root[own:], axis=1), np.linalg.norm(pulled[own:], axis=1)
+        ratios = np.abs(step[own:]) / np.maximum(sizes, 1e-300)
+        clearness = float(np.max(ratios, where=by_prior**2 <= FROM_PRIOR * sizes**2, initial=0.0))
         factor, least = student(groups - 1), student(groups - 1, _LEVEL)
         return Shift(terms, T[:, kept] @ step, T[:, kept] @ root, factor, clearness, least)
 
@@ -109,11 +120,13 @@ def find_shifts(
     # Unit diagonal: parameters differ by many orders of magnitude in size.
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     T, g, G, H = T * unit, g * unit, G * unit * unit[:, None], H * unit * unit[:, None]
+    # As of `intervals`: at least weight 1 counts.
+    root = unit[:, None] * psd_root(prior) * np.sqrt(max(setting.prior, 1.0))
     # With all groups, and without each of them. The fit's own parameters are eliminated once for all terms.
     curvatures = np.concatenate([H[None], H - G])
     inverses = np.stack([invert(one[:own, :own]) for one in curvatures])
 
-    system = _Extended(T, g, G, curvatures, inverses)
+    system = _Extended(T, root, g, G, curvatures, inverses)
     ends = own + np.cumsum([len(places) for _, places in tried])
     indices = {term: np.arange(end - len(places), end) for end, (term, places) in zip(ends, tried, strict=True)}
     every = [system.extend((term,), new) for term, new in indices.items()]
@@ -147,7 +160,7 @@ def include_shifts(found: Intervals, shifts: Sequence[Shift], rows: np.ndarray, 
 
 
 def _widen(spread: Spread, change: np.ndarray, root: np.ndarray, factor: float, own: float) -> Spread:
-    reach = np.abs(change) + factor * np.sqrt(np.sum(root**2, axis=1) + spread.prior_share * spread.std**2)
+    reach = np.abs(change) + factor * np.linalg.norm(root, axis=1)
     # NaN, of terms held at zero, stays.
     std = np.maximum(spread.std, reach / own)
     share = spread.prior_share * (spread.std / np.where(std > 0, std, 1.0)) ** 2

@@ -353,8 +353,11 @@ def test_bad_arguments_raise(truth):
 
 
 def coverage(noises, count, size=0.05):
-    """Share of 95 % intervals of base parameters that hold the truth, over random arms; noises(seed, n) are (n, 2)."""
-    inside = []
+    """Share of 95 % intervals of base parameters that hold the truth, over random arms; noises(seed, n) are (n, 2).
+
+    And root mean squares (n,) of the errors of each number in standard deviations: intervals that are too wide hold any truth.
+    """
+    inside, sizes = [], []
     for seed in range(count):
         model, nominal = arm(0.2, seed), arm()
         x = identify.nominal_parameters(model)
@@ -364,7 +367,8 @@ def coverage(noises, count, size=0.05):
         fit = identify.fit_robot(nominal, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals
         off = np.abs(fit.base.values - fit.combinations.values(x))
         inside.append(off <= fit.factor * fit.base.std)
-    return np.mean(inside)
+        sizes.append(off / fit.base.std)
+    return np.mean(inside), np.sqrt(np.mean(np.square(sizes), axis=0))
 
 
 def white(seed, n):
@@ -542,17 +546,28 @@ def test_the_share_of_the_variance_that_groups_see_is_that_of_theory():
     assert expected < 0.8
 
 
-@pytest.mark.slow
-def test_intervals_cover():
-    """1 % of noise on the torques, 8 arms of 13 combinations: 95 % intervals hold the truth nine times in ten."""
-    assert coverage(white, 8) >= 0.90
+def test_intervals_cover_and_are_not_too_wide():
+    """1 % of noise on the torques, 8 arms of 13 combinations: 95 % intervals hold the truth nine times in ten.
+
+    The weight of the first link and a spring at its joint are one torque: no log supports the spring, which the prior would take
+    for the difference of the arm from the nominal one.
+    """
+    share, sizes = coverage(white, 8)
+    assert share >= 0.90
+    # 8 arms know a mean square to a half.
+    assert sizes.min() > 0.4 and sizes.max() < 2.0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noises", [white, correlated, lasting])
 def test_intervals_cover_for_many_arms(noises):
-    """As above; 40 arms, and noise that is correlated: over a thirtieth of the log, and over a fifth."""
-    assert 0.90 <= coverage(noises, 40) <= 0.99
+    """As above; 40 arms, and noise that is correlated: over a thirtieth of the log, and over a fifth.
+
+    Errors that are not white may be those of the model, so that the log, worth 30 independent samples, counts as ten.
+    """
+    share, sizes = coverage(noises, 40)
+    print(f"{noises.__name__}: {share:.3f}, errors in standard deviations {sizes.min():.2f} to {sizes.max():.2f}")
+    assert share >= 0.90 and sizes.min() > (0.7 if noises is white else 0.7 / np.sqrt(3)) and sizes.max() < 1.5
 
 
 def test_what_no_data_touch_is_from_the_prior(truth):
