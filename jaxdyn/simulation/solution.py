@@ -264,7 +264,7 @@ class Signal(NamedTuple):
     units: tuple[str, ...]
 
 
-def signals(solution: Any, scene: Any) -> list[Signal]:
+def signals(solution: Solution, scene: SceneLike) -> list[Signal]:
     """Arrays of a solution that have one row for each save point, with names and units.
 
     **Raises:** ValueError when the scene is not that of the solution.
@@ -272,7 +272,7 @@ def signals(solution: Any, scene: Any) -> list[Signal]:
     return [one._replace(values=np.asarray(one.values)) for one in signals_as_given(solution, scene)]
 
 
-def signals_as_given(solution: Any, scene: Any) -> list[Signal]:
+def signals_as_given(solution: Solution, scene: SceneLike) -> list[Signal]:
     """Signals with the values of the solution unconverted, so that it may be traced (see `signals`)."""
     scene = as_scene(scene)
     if np.shape(solution.q)[-1:] != (scene.nq,) or np.shape(solution.v)[-1:] != (scene.nv,):
@@ -307,7 +307,7 @@ def _row_names(scene: Scene) -> tuple[str, ...]:
     )
 
 
-def times(solution: Any) -> np.ndarray:
+def times(solution: Solution) -> np.ndarray:
     """Save points (nt,). **Raises:** ValueError where those of a batch differ."""
     ts = np.asarray(solution.ts)
     ts = ts.reshape(-1, ts.shape[-1])
@@ -316,7 +316,7 @@ def times(solution: Any) -> np.ndarray:
     return ts[0]
 
 
-def write_csv(solution: Any, path: str | os.PathLike, scene: Any) -> None:
+def write_csv(solution: Solution, path: str | os.PathLike, scene: SceneLike) -> None:
     """Write a solution as CSV; see `Solution.to_csv`."""
     path = _check_path(path, ".csv")
     columns, ts = signals(solution, scene), times(solution)
@@ -343,7 +343,7 @@ def write_csv(solution: Any, path: str | os.PathLike, scene: Any) -> None:
             writer.writerows(first + [repr(float(x)) for x in (t, *row)] for t, row in zip(ts, motion, strict=True))
 
 
-def write_npz(solution: Any, path: str | os.PathLike, scene: Any) -> None:
+def write_npz(solution: Solution, path: str | os.PathLike, scene: SceneLike) -> None:
     """Write a solution as an archive of NumPy; see `Solution.to_npz`."""
     path = _check_path(path, ".npz")
     arrays: dict[str, np.ndarray] = {"t": times(solution)}
@@ -364,7 +364,7 @@ def dimensions(signal: Signal) -> tuple[str, ...]:
     return ("t", axes.get(signal.key, f"{signal.key}_part")) if signal.names else ("t",)
 
 
-def as_xarray(solution: Any, scene: Any) -> Any:
+def as_xarray(solution: Solution, scene: SceneLike) -> Any:
     """Convert a solution to a dataset of xarray; see `Solution.to_xarray`."""
     try:
         import xarray
