@@ -94,10 +94,10 @@ def checkpoint_at(path: Any, problem: Any, every: Any, resume: bool) -> Checkpoi
     return Checkpoint(as_path(path, "checkpoint"), fingerprint(problem), resume=resume, **often)
 
 
-def write(path: pathlib.Path, problem: str, arrays: dict[str, np.ndarray]) -> None:
+def write(path: pathlib.Path, problem: str, arrays: dict[str, Any]) -> None:
     """Write a checkpoint atomically: `path` holds the previous one or this one whenever the process ends."""
     buffer = io.BytesIO()
-    np.savez(buffer, problem=np.array(problem), **arrays)  # pyright: ignore[reportArgumentType]
+    np.savez(buffer, problem=np.array(problem), **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
     # In the same folder, as a rename is atomic within one file system only; by process, so that two fits do not share it.
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")

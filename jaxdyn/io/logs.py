@@ -94,7 +94,7 @@ def write_log(path: FilePath, log: Log) -> None:
     **Raises:** ValueError for another file type.
     """
     path = as_path(path)
-    columns: dict[str, np.ndarray] = {"t": np.asarray(log.t)}
+    columns: dict[str, Any] = {"t": np.asarray(log.t)}
     # A quaternion has four coordinates for three velocities, so a name for each column of q does not exist.
     named = log.joint_names if log.q.shape[1] == log.nv else None
     for signal in _SIGNALS:
@@ -104,7 +104,7 @@ def write_log(path: FilePath, log: Log) -> None:
         for i in range(value.shape[1]):
             columns[f"{signal}_{named[i]}" if named else f"{signal}{i + 1}"] = np.asarray(value[:, i])
     if path.suffix.lower() == ".npz":
-        np.savez_compressed(path, **columns)  # pyright: ignore[reportArgumentType]
+        np.savez_compressed(path, **columns)
     elif path.suffix.lower() == ".csv":
         # newline="" is required by `csv`: on Windows the line ends would otherwise be doubled.
         with path.open("w", newline="") as file:

@@ -139,14 +139,20 @@ class Sampled(eqx.Module):
         return self.update(q, v, t, state)
 
 
-def as_control(control: Any) -> Any:
+if TYPE_CHECKING:
+    Control = Callable[[Array, Array, Array], Array] | Controller | Sampled | None
+else:
+    Control = Any  # `as_control` checks it
+
+
+def as_control(control: Control) -> Any:
     """Control as a pytree, so that its arrays are inputs of the compiled run. **Raises:** ValueError if it is not callable."""
     if control is None or isinstance(control, (Controller, Sampled)):
         return control
     return as_pytree(control, "control")
 
 
-def check_steps(control: Any, stepsize: Any) -> None:
+def check_steps(control: Control, stepsize: Any) -> None:
     """Refuse steps that do not fit a sampled law: adaptive ones, and those that do not fill a period."""
     if not isinstance(control, Sampled):
         return
@@ -165,12 +171,12 @@ def check_steps(control: Any, stepsize: Any) -> None:
             )
 
 
-def can_end(control: Any, q, v, t) -> bool:
+def can_end(control: Control, q, v, t) -> bool:
     """Decide whether a control has an allowance, which may end the motion."""
     return isinstance(control, Controller) and eqx.filter_eval_shape(control.allowance, q, v, t) is not None
 
 
-def check_control(scene: Scene, control: Any, q, v, t) -> None:
+def check_control(scene: Scene, control: Control, q, v, t) -> None:
     """Check the shapes of a control's results by tracing one call of it, with the arguments that the integration passes.
 
     **Raises:** ValueError for a control that takes other arguments, shapes that do not fit, and states that change structure.
@@ -195,7 +201,7 @@ def check_control(scene: Scene, control: Any, q, v, t) -> None:
         check_callback(control, "control", "control(q, v, t)", q, v, t)
 
 
-def initial_entries(control: Any, q, v, t) -> dict[str, Array]:
+def initial_entries(control: Control, q, v, t) -> dict[str, Array]:
     """Initial values of the control's entries in the state of the equation; empty for a plain function."""
     if isinstance(control, Sampled):
         # The record has no samples yet, so that the first one is due at the start.
@@ -223,7 +229,7 @@ def sample(control: Sampled, held: Float[Array, " n"], q, v, t) -> Float[Array, 
     return jnp.where(due, fresh, held)
 
 
-def torque(control: Any, scene: Scene, y, q, v, t, multipliers: Callable) -> Array | None:
+def torque(control: Control, scene: Scene, y, q, v, t, multipliers: Callable) -> Array | None:
     """Torque (nv,) of a control, None without a control. `multipliers`: tau (nv,) -> lam (nc,), of the constrained dynamics.
 
     `y` is the state of the equation, of which q and v are parts.
@@ -275,7 +281,7 @@ def state_of(control: Any, y, q, v, t) -> Any:
     return ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, q.dtype), like))[1](y[STATE])
 
 
-def at_start(control: Any, q, v, t) -> Any:
+def at_start(control: Control, q, v, t) -> Any:
     """Control as a function (q, v, t) -> tau for a linearisation at this state (`find_stiffness`).
 
     The state of a controller is held at the value with which a run from here would start. None where tau is no function of
@@ -326,9 +332,3 @@ def _check_state(state, returned, name: str) -> None:
     shapes = [jax.tree.map(jnp.shape, x) for x in (state, returned)]
     if shapes[0] != shapes[1]:
         raise ValueError(f"{name} returned a state of shapes {shapes[1]}, expected {shapes[0]}; keep its structure")
-
-
-if TYPE_CHECKING:
-    Control = Callable[[Array, Array, Array], Array] | Controller | Sampled | None
-else:
-    Control = Any  # `as_control` checks it

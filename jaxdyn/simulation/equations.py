@@ -38,7 +38,15 @@ def power(force, v):
 
 
 def equations(
-    scene: Scene, control: Any, method: Method, start: dict, q0, v0, t0, conditions: Conditions, terminals: tuple = ()
+    scene: Scene,
+    control: controls.Control,
+    method: Method,
+    start: dict,
+    q0,
+    v0,
+    t0,
+    conditions: Conditions,
+    terminals: tuple = (),
 ) -> tuple["Equations", tuple | None]:
     """Equations of a run and their arguments; `start`: entries of the control and the drives at the start (q0, v0, t0)."""
     # diffrax compiles its arguments, which hides their values. Known leaves are compiled in, the rest is `args`: flat, because
@@ -245,7 +253,7 @@ def state_outputs(system, outputs, q, v, t) -> dict[str, Any]:
 
 
 def at_save_point(
-    scene: Scene, control: Any, method: Method, eqs: Equations, args, outputs, q, v, t, of_control
+    scene: Scene, control: controls.Control, method: Method, eqs: Equations, args, outputs, q, v, t, of_control
 ) -> dict[str, Any]:
     """Outputs at one state; `of_control`: entries of the control and the drives in the state."""
     values = state_outputs(scene.system, outputs, q, v, t)

@@ -346,7 +346,7 @@ def write_csv(solution: Solution, path: str | os.PathLike, scene: SceneLike) -> 
 def write_npz(solution: Solution, path: str | os.PathLike, scene: SceneLike) -> None:
     """Write a solution as an archive of NumPy; see `Solution.to_npz`."""
     path = _check_path(path, ".npz")
-    arrays: dict[str, np.ndarray] = {"t": times(solution)}
+    arrays: dict[str, Any] = {"t": times(solution)}
     units: dict[str, Any] = {"t": "s"}
     names: dict[str, list] = {}
     for signal in signals(solution, scene):
@@ -354,8 +354,8 @@ def write_npz(solution: Solution, path: str | os.PathLike, scene: SceneLike) -> 
         units[signal.key] = list(signal.units) if signal.names else signal.units[0]
         names[signal.key] = list(signal.names)
     arrays |= {f"pose_{name}": np.asarray(pose) for name, pose in solution.poses.items()}
-    texts = {"names": np.array(json.dumps(names)), "units": np.array(json.dumps(units))}
-    np.savez_compressed(path, **arrays, **texts)  # pyright: ignore[reportArgumentType]
+    texts: dict[str, Any] = {"names": np.array(json.dumps(names)), "units": np.array(json.dumps(units))}
+    np.savez_compressed(path, **arrays, **texts)
 
 
 def dimensions(signal: Signal) -> tuple[str, ...]:
