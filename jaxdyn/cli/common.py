@@ -276,7 +276,7 @@ class Stopwatch:
 # --- options `--client` and `--workers`: Dask clusters that compute for a command ---
 
 
-def add_cluster_options(parser: Any) -> None:
+def add_cluster_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> None:
     """Add the options to a parser or to a group of one."""
     place = parser.add_mutually_exclusive_group()
     place.add_argument(

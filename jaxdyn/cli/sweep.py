@@ -188,7 +188,7 @@ def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
             raise ValueError(f"parameter {name}: log_uniform = {ends}; give positive numbers")
         drawn[name] = (kinds[0], float(ends[0]), float(ends[1]), (int(given["size"]),) if "size" in given else ())
 
-    def draw(key: Any) -> dict[str, Any]:
+    def draw(key: jax.Array) -> dict[str, Any]:
         keys = jax.random.split(key, max(1, len(drawn)))
         values = {
             name: _DRAWS[kind](own, a, b, shape)
