@@ -49,6 +49,9 @@ def any_sample(flag) -> Any:
 
 def cond(flag, if_true: Callable, if_false: Callable, *operands) -> Any:
     """`lax.cond`, where the flag () is set for any sample of the batch."""
+    if is_expanding() and is_careful() and not has_branches():
+        # The careful program of a function with derivatives has no branches, and is the last that could compute the sample.
+        return jax.tree.map(lambda x, y: jnp.where(flag, x, y), if_true(*operands), if_false(*operands))
     return lax.cond(any_sample(flag), if_true, if_false, *operands)
 
 

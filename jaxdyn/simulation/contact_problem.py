@@ -232,7 +232,9 @@ def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, gaps, v, free, h):
     ]
     e = jnp.stack([*restitution, *[jnp.zeros(())] * len(contacts.limited)]).astype(free.dtype)
     reach = -terms.gap / h
-    bound = jnp.where(terms.gap < 0, jnp.minimum(reach, jnp.maximum(-free, bent)), reach)
+    # The approach of a start that is in contact, which no step before has reduced, comes out by restitution alone.
+    driven = jnp.maximum(jnp.minimum(-free, jnp.abs(change)), bent)
+    bound = jnp.where(terms.gap < 0, jnp.minimum(reach, driven), reach)
     # Closing in the next step, and faster than forces close it.
     is_impact = (free < bound) & (-now > _IMPACT * jnp.abs(change)) & (e > 0)
     # Under a constant force, which changes the velocity by d in the step, the velocity u after the way h u is the root of

@@ -9,7 +9,8 @@ with the rows A of the constraints and J of the contacts there and M at the midp
 where the normal velocity counts from a bound n . v' >= c:
 
     c = -gap / h             the contact closes in the next step at the earliest,
-    c = min(-gap / h, max(-u, w))    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
+    c = min(-gap / h, max(d, w))    for a gap below zero; d = min(-u, |u - n . v|), u = n . v_f: no more velocity comes out
+                             than forces have driven in,
     c = e |u|                for an impact: the contact closes in the next step, with restitution e.
 
 The step along v bends, as that of a ball whose velocity turns with it; w is the velocity by which this has closed the gap.

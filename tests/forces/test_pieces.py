@@ -77,6 +77,23 @@ def test_gradient_through_a_stop_by_other_steps(options):
     np.testing.assert_allclose(jacobian(lambda x: end(mass(20.0), x, **options))(X), exact, atol=1e-6)
 
 
+@pytest.mark.parametrize("adjoint", ["reverse", "forward"])
+def test_gradient_through_a_stop_that_is_met_at_a_save_point(adjoint):
+    """To rounding at 0.5 s; half a period of the spring later the body goes back with the velocity v that it had."""
+    builder = jd.ModelBuilder("mass", gravity=None)
+    inertia = (2.0, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    builder.add_body("mass", None, "prismatic", inertia, axis=(1, 0, 0), lower=-np.inf, upper=0.2)
+    scene = jd.Scene(builder.build(), forces=[jd.forces.JointStops(200.0, 0.0)])
+
+    def places(v):
+        return jd.simulate(scene, jnp.zeros(1), v[None], jnp.asarray([0.0, 0.5, 1.0]), adjoint=adjoint).q[1:, 0]
+
+    v, half = jnp.asarray(0.4), np.pi / 10
+    np.testing.assert_allclose(places(v), [0.5 * v, 0.4 - v * (1 - half)], atol=1e-8)
+    jacobian = (jax.jacfwd if adjoint == "forward" else jax.jacrev)(places)(v)
+    np.testing.assert_allclose(jacobian, [0.5, half - 1], atol=1e-7)
+
+
 @pytest.mark.slow
 def test_gradient_of_steps_through_a_stop():
     """RK4 with 5 ms, which ends at the stop: to (0.16)^4 / 120 of the derivatives, up to 6."""

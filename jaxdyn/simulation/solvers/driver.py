@@ -111,7 +111,11 @@ def begin(plan: Plan, control, args, ts, y0, rtol, atol, stepsize, records=()) -
     limits = Limits(start, end, floor, least_at_end, steps, rtol, atol, y0)
     search = None if plan.guards is None else Search.begin(values, values < -levels, jnp.asarray(length, ts.dtype))
     sums = no_sums(plan.structure(y0))
-    t_next = jnp.minimum(start + length, end)
+    if isinstance(control, AdaptiveSteps):
+        # A replay of a motion with events may be as short as the rounding of their times.
+        length = jnp.maximum(length, least_step(start, least_at_end))
+    t_next = start + length
+    t_next = jnp.where(t_next > floor, end, t_next)
     # What is not reached stays infinite, which tells it from rows that are computed.
     rows = jnp.broadcast_to(jnp.full_like(y0, jnp.inf), (ts.shape[0] - 1, y0.size))
     state = State(start, t_next, y0, rate, no, none, none, no, quality, quality == 0, sums, search)
@@ -265,4 +269,7 @@ def _control_step(plan: Plan, control, limits: Limits, state: State, t1, step: S
         return NextStep(jnp.asarray(True), limits.end - limits.start, state.at_least, jnp.asarray(False))
     before, after, error = (plan.structure(x) for x in (state.y, step.projected, step.error))
     size = error_size(control.size, before, after, error, limits.rtol, limits.atol)
-    return next_step(size, control.order, t1 - state.t, state.at_least, least_step(state.t, limits.least_at_end))
+    least = least_step(state.t, limits.least_at_end)
+    decided = next_step(size, control.order, t1 - state.t, state.at_least, least)
+    # Behind the end there is no step that could be too short.
+    return decided._replace(failed=decided.failed & ~(decided.kept & (t1 >= limits.end)))
