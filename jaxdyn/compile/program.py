@@ -206,8 +206,8 @@ def as_kind(value, kind: str):
 # --- numbers of a program while it is written ---
 #
 # Both kinds, unknown `Number`s and known ones with their type, are entries of NumPy arrays of objects, so that NumPy's own
-# functions move, sum and multiply them. Known numbers carry their type: a Python float is a float64 and a Python bool a bool,
-# all others are scalars of NumPy. So known integers wrap, and known float32 numbers round, as they would in XLA.
+# functions move them, and `Graph` computes with them. Known numbers carry their type: a Python float is a float64 and a Python
+# bool a bool, all others are scalars of NumPy. So known integers wrap, and known float32 numbers round, as they would in XLA.
 
 
 class Number:
@@ -219,33 +219,6 @@ class Number:
     def __init__(self, graph: Any, op: str, kind: str, args: tuple):
         self.graph, self.op, self.kind, self.args = graph, op, kind, args
         self.place: int | None = None  # in the finished program
-
-    def __add__(self, other):
-        return self.graph.add(self, other)
-
-    def __radd__(self, other):
-        return self.graph.add(other, self)
-
-    def __sub__(self, other):
-        return self.graph.sub(self, other)
-
-    def __rsub__(self, other):
-        return self.graph.sub(other, self)
-
-    def __mul__(self, other):
-        return self.graph.mul(self, other)
-
-    def __rmul__(self, other):
-        return self.graph.mul(other, self)
-
-    def __truediv__(self, other):
-        return self.graph.div(self, other)
-
-    def __rtruediv__(self, other):
-        return self.graph.div(other, self)
-
-    def __neg__(self):
-        return self.graph.neg(self)
 
 
 def is_number(x) -> bool:

@@ -109,10 +109,6 @@ class MassFactor(NamedTuple):
         """Accelerations M^-1 f."""
         return self.unwhiten(self.whiten(forces))
 
-    def momentum(self, velocities: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-        """Whitened momentum U^T v, the inverse of `unwhiten`."""
-        return self.reversed.T @ velocities[::-1]
-
     def is_definite(self) -> Bool[Array, ""]:
         """Decide whether M is positive definite with every pivot above rounding."""
         return _has_pivots(self.reversed, self.diagonal)

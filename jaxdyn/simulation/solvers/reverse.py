@@ -72,17 +72,6 @@ def row(y, t0, t1, kept) -> tuple:
     return y, jnp.stack([t0, t1]), kept
 
 
-def write(rows: tuple, strides: tuple[int, ...], new: tuple, index, active) -> tuple:
-    """Write the row of step `index` to a history, if the step was taken."""
-
-    def one(array, value, stride):
-        # Rows that are not asked for are written beyond the end of the array, where XLA drops them.
-        asked = active if stride == 1 else active & (index % stride == 0)
-        return array.at[jnp.where(asked, index // stride, array.shape[0])].set(value, mode="drop")
-
-    return tuple(map(one, rows, new, strides))
-
-
 class _Ends(NamedTuple):
     """Constants of the way back: the first step, the ends of the run, and the number of fixed steps or None."""
 
