@@ -149,16 +149,19 @@ def _with_invalid_derivatives(values, failed, leaves):
 
 
 def _invalid_tangents(primals, tangents):
-    values, failed, _ = primals
+    values, failed, leaves = primals
     of_values, _, of_leaves = tangents
     zero = jax.custom_derivatives.SymbolicZero
     moving = [x for x in of_leaves if not isinstance(x, zero)]
+    # One, with derivatives: those of higher order are NaN too, where those of a constant NaN would be zero.
+    shifts = [x - jax.lax.stop_gradient(x) for x, dx in zip(leaves, of_leaves, strict=True) if not isinstance(dx, zero)]
+    one = jnp.exp(sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in shifts))
 
     def add(value, tangent):
         tangent = jnp.zeros_like(value) if isinstance(tangent, zero) else tangent
         here = failed.reshape(failed.shape + (1,) * (value.ndim - failed.ndim))
         # At both ends, so that neither tangents nor cotangents that cancel in the sum hide the failure.
-        terms = (jnp.sum(_nan_where(failed.any(), x)).astype(value.dtype) for x in moving)
+        terms = (jnp.sum(_nan_where(failed.any(), x * one.astype(x.dtype))).astype(value.dtype) for x in moving)
         return tangent + _nan_where(here, jnp.broadcast_to(sum(terms, jnp.zeros((), value.dtype)), value.shape))
 
     return _with_invalid_derivatives(*primals), jax.tree.map(

@@ -95,7 +95,8 @@ ADVICE = {
     "bad_event": "give jd.events.Terminal a function that is above zero at the start",
     "singular_basis": "choose another basis: jd.Reduced() continues one automatically where the rank of the rows is constant; "
     "method='projected' needs none",
-    "nonlinear_divergence": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "nonlinear_divergence": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite; where "
+    "constraints lose rank on the way, as in a flat linkage, method='projected'",
     "contradictory_rows": "remove a constraint, or change one that moves with time, so that some motion satisfies all of them",
     "open_constraints": "take smaller steps (stepsize, or rtol and atol), or look for constraints that contradict each other "
     "on the way",

@@ -255,6 +255,21 @@ def test_cotangents_of_a_failed_run_are_nan(name):
     assert np.isfinite(slopes[::2]).all() and np.all(np.abs(slopes[::2, 1]) > 0.1)
 
 
+@pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
+def test_second_derivatives_of_a_failed_run_are_nan(outer):
+    """As the first ones, and not zero, which the derivative of a constant NaN would be; a loss that leaves it out has its own."""
+    model, (q, v) = jd.scenes.double_pendulum(), jd.scenes.double_pendulum.start()[:2]
+
+    def end(q, masked, max_steps=16):
+        steps = jd.simulation.Steps(rtol=1e-9, atol=1e-9, max_steps=max_steps)
+        motion = jd.simulate(model, q, v, np.array([0.0, 1.0]), stepsize=steps)
+        return jnp.where(masked & ~motion.success, q @ q, motion.q[-1].sum())
+
+    hessian = jax.jit(outer(jax.grad(end)))
+    assert np.isnan(hessian(q, False)).all()
+    np.testing.assert_array_equal(hessian(q, True), 2 * np.eye(2))
+
+
 @pytest.mark.parametrize("adjoint", ["reverse", "direct"])
 def test_cotangents_of_a_step_that_failed_are_nan(adjoint):
     """A stepper has no code: its values are NaN, and so are its derivatives, by the state, the torque and the parameters."""
