@@ -207,11 +207,11 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
         raise ValueError(
             f"stepsize is {stepsize!r}, and {what}; leave it out for steps that keep rtol and atol, or give a length (s)"
         )
-    from jaxdyn.simulation.solvers.choice import has_name, has_own_loop, label
+    from jaxdyn.simulation.solvers.choice import has_name, has_own_loop, option_of
 
     if not has_own_loop(solver):
         raise ValueError(
-            f"solver is {label(solver)}, and {what}, whose events are located within steps of the library; take an explicit "
+            f"{option_of(solver)}, and {what}, whose events are located within steps of the library; take an explicit "
             "solver, such as diffrax.Tsit5(), or, where forces are stiff, jd.solvers.Rodas5P()"
         )
     if is_backsolve(adjoint):

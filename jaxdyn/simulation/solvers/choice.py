@@ -24,7 +24,7 @@ import optimistix
 from jaxdyn.compile.known import is_known
 from jaxdyn.simulation.options import ADJOINTS, Options, check_step_length, is_backsolve, is_step_length
 from jaxdyn.simulation.solvers.base import Adaptive, ErrorMonitoredSteps
-from jaxdyn.simulation.solvers.diffrax_methods import RK4, LieGroup, Rodas5P
+from jaxdyn.simulation.solvers.diffrax_methods import RK4, LieGroup, Rodas5P, Stepper
 from jaxdyn.systems.scene import Scene
 
 if TYPE_CHECKING:
@@ -99,6 +99,11 @@ def label(solver: diffrax.AbstractSolver) -> str:
     """Name of a method, with that of the wrapped one in brackets."""
     name, inner = type(solver).__name__, getattr(solver, "solver", None)
     return f"{name}({label(inner)})" if isinstance(inner, diffrax.AbstractSolver) else name
+
+
+def option_of(solver: diffrax.AbstractSolver) -> str:
+    """The user's option by which a run has a method, for messages."""
+    return "method is 'variational'" if isinstance(solver, Stepper) else f"solver is {label(solver)}"
 
 
 def has_own_loop(solver: diffrax.AbstractSolver) -> bool:
@@ -232,7 +237,7 @@ _LOOPS: tuple[tuple[Callable[[_Facts], bool], str, str], ...] = (
     (
         lambda x: not has_own_loop(x.solver),
         "diffrax",
-        "solver is {solver}; take jd.solvers.Rodas5P(), or an explicit one, such as diffrax.Dopri8()",
+        "{option}; take jd.solvers.Rodas5P(), or an explicit solver, such as diffrax.Dopri8()",
     ),
     (
         lambda x: type(x.controller) not in (Adaptive, ErrorMonitoredSteps),
@@ -260,4 +265,4 @@ def choose_loop(solver, controller, options: Options, guards, quality, pieces: t
     """
     facts = _Facts(solver, controller, options, guards, quality, pieces)
     loop, reason = next((loop, reason) for applies, loop, reason in _LOOPS if applies(facts))
-    return loop, reason.format(solver=label(options.solver), adjoint=type(options.adjoint).__name__)
+    return loop, reason.format(option=option_of(options.solver), adjoint=type(options.adjoint).__name__)
