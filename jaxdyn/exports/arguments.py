@@ -4,7 +4,7 @@ import inspect
 import keyword
 import re
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -15,11 +15,6 @@ from jaxdyn.compile.program import kind_of
 from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, Field, Text, all_finite
 from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
-
-if TYPE_CHECKING:
-    from jaxdyn.exports.exported import Exported
-else:
-    Exported = Any  # which imports this module
 
 C_TYPES = {"float64": "double", "float32": "float"}
 # Of C11 and C++20 together: the header is read by both.
@@ -151,7 +146,7 @@ def comment_on(name: str, size: int, system: Model | None) -> str:
     return ", ".join(f"{entry} [{unit}]" for entry, unit in zip(entries, units, strict=True))
 
 
-def batch_ir(exported: "Exported", width: int) -> Text:
+def batch_ir(exported: Any, width: int) -> Text:
     """Text of `i32 name_batch(i64 n, ptr a0, ..., ptr r0, ...)` over the samples 0 .. n - 1.
 
     Arrays have one row for each sample; a structure is the same for all. The status has the bits of all samples. Results of
@@ -246,7 +241,7 @@ def _all_lanes(e: Emitter, flag: str) -> str:
     return e.emit(f"call i1 @{name}({e.type('b1')} {flag})")
 
 
-def _single_calls(e: Emitter, exported: "Exported", rows: dict[int, list[str]]) -> str:
+def _single_calls(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> str:
     """Call the function of one sample for each of the W samples; returns the bits of all statuses."""
     count = len(exported.arguments) + len(exported.value.program.outputs) - 1
     total = "0"

@@ -8,7 +8,7 @@ Source: CasADi's user guide, "Using the generated code", and the signatures that
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,11 +17,6 @@ from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.program import Array, Constant
 from jaxdyn.compile.standalone import Routine, Text
 from jaxdyn.exports.arguments import fields_of
-
-if TYPE_CHECKING:
-    from jaxdyn.exports.exported import Exported
-else:
-    Exported = Any  # which imports this module
 
 
 class Pattern(NamedTuple):
@@ -69,7 +64,7 @@ def _block(is_stored: np.ndarray, result: Pattern, argument: Pattern) -> Pattern
     return Pattern(stored, _by_columns(stored)[where].ravel())
 
 
-def casadi_ir(exported: "Exported", lanes: int) -> str:
+def casadi_ir(exported: Any, lanes: int) -> str:
     """Text of `name`, and of `jac_name` where the Jacobian was exported, with the functions that describe them to CasADi."""
     # CasADi finds the Jacobian of `name` by the name of its function, `jac_name`, and asks it for all blocks at once.
     program, jacobian = exported.value.program, exported.derivative
@@ -91,7 +86,7 @@ def casadi_ir(exported: "Exported", lanes: int) -> str:
 def _functions(
     name: str,
     routine: Routine,
-    exported: "Exported",
+    exported: Any,
     inputs: Sequence[Pattern],
     outputs: Sequence[Pattern],
     nominal: Sequence[Pattern],

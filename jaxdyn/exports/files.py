@@ -4,7 +4,7 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,16 +12,11 @@ import numpy as np
 from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, LinkableFile, Triple
 from jaxdyn.exports.arguments import C_TYPES, Argument
 
-if TYPE_CHECKING:
-    from jaxdyn.exports.exported import Exported
-else:
-    Exported = Any  # which imports this module
-
 TOLERANCE = 1e-12  # of the test program, relative: other processors round fused operations otherwise
 _TOLERANCE_SINGLE = 1e-4  # a thousand roundings of float32, which accelerations of long chains lose
 
 
-def write_files(exported: "Exported", folder: Path, made: LinkableFile, target: Triple, abi: str) -> Path:
+def write_files(exported: Any, folder: Path, made: LinkableFile, target: Triple, abi: str) -> Path:
     """Write all files; none where one cannot be written. **Raises:** ValueError where the folder cannot be written."""
     name = exported.name
     contents: dict[str, bytes] = {f"{name}.o": made.binary}
@@ -48,7 +43,7 @@ def write_files(exported: "Exported", folder: Path, made: LinkableFile, target: 
 # --- the header ---
 
 
-def header(exported: "Exported", made: LinkableFile, target: Triple) -> str:
+def header(exported: Any, made: LinkableFile, target: Triple) -> str:
     """C header: sizes, structures, and one prototype for each function."""
     name, upper = exported.name, exported.name.upper()
     lines = [
@@ -82,7 +77,7 @@ def header(exported: "Exported", made: LinkableFile, target: Triple) -> str:
     return "\n".join(lines)
 
 
-def _definitions(exported: "Exported", made: LinkableFile) -> list[str]:
+def _definitions(exported: Any, made: LinkableFile) -> list[str]:
     """Lines with the sizes of arrays, the bytes of stack, and the structures."""
     name, upper = exported.name, exported.name.upper()
     lines = []
@@ -105,7 +100,7 @@ def _definitions(exported: "Exported", made: LinkableFile) -> list[str]:
     return lines
 
 
-def _prototypes(exported: "Exported") -> list[str]:
+def _prototypes(exported: Any) -> list[str]:
     """Lines with the prototypes, and the order and units of the entries of each argument."""
     name = exported.name
     lines = ["", "/*", f" * {name}: arrays are stored by rows. Results may overwrite arguments."]
@@ -141,7 +136,7 @@ def _type_of(name: str, argument: Argument) -> str:
     return f"{name}_{argument.name}_t"
 
 
-def _parameters(exported: "Exported", results: list, is_batch: bool = False) -> str:
+def _parameters(exported: Any, results: list, is_batch: bool = False) -> str:
     # Sizes in brackets mean nothing to the compiler of the callee; gcc and clang warn callers of arrays that are too short.
     parameters = []
     for argument in exported.arguments:
@@ -173,7 +168,7 @@ def _numbers(values: np.ndarray) -> str:
     )
 
 
-def test_program(exported: "Exported") -> str:
+def test_program(exported: Any) -> str:
     """C program that compares the functions with reference results, and returns non-zero where they differ."""
     name = exported.name
     data, checks = _references(exported)
@@ -212,7 +207,7 @@ def test_program(exported: "Exported") -> str:
     return "\n".join(lines)
 
 
-def _references(exported: "Exported") -> tuple[list[str], list[str]]:
+def _references(exported: Any) -> tuple[list[str], list[str]]:
     """Lines with the arguments and the expected results, and lines that call the functions and compare."""
     # The prefixes keep names apart from those of the C library: y0 is a Bessel function of <math.h>.
     name, data, checks = exported.name, [], []
@@ -276,7 +271,7 @@ target_link_libraries({name} m)
 """
 
 
-def _casadi_test(exported: "Exported") -> str:
+def _casadi_test(exported: Any) -> str:
     arguments = ", ".join(np.asarray(x).tolist().__repr__() for x in exported.examples)
     expected = ", ".join(x.tolist().__repr__() for x in exported.evaluate())
     return f'''"""Compares {exported.name}.so with reference results of jaxdyn; needs casadi and numpy."""

@@ -5,17 +5,12 @@ import difflib
 import itertools
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jaxdyn.model.arguments import check_name
 from jaxdyn.model.joints import KINDS, screw_mask
-
-if TYPE_CHECKING:
-    from jaxdyn.model.tree import Model
-else:
-    Model = Any  # which imports this module
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -132,7 +127,7 @@ class Topology:
         return tuple(tables)
 
 
-def body_index(model: "Model", name: str | None) -> int:
+def body_index(model: Any, name: str | None) -> int:
     """Index of a body by name; None means the world, -1.
 
     **Raises:** ValueError for a name that is neither a body nor a frame merged into one; similar names are listed.
@@ -146,7 +141,7 @@ def body_index(model: "Model", name: str | None) -> int:
     return model.topology.frame_bodies[frame_index(model, name)]
 
 
-def frame_index(model: "Model", name: str) -> int:
+def frame_index(model: Any, name: str) -> int:
     """Index of a frame by name; the name of a joint means the frame of its child link unless a frame has that name.
 
     **Raises:** ValueError when there is no frame of that name; names that look alike are listed.
@@ -160,7 +155,7 @@ def frame_index(model: "Model", name: str) -> int:
         raise ValueError(f"frame {name!r} is not in model {model.name!r}; {_hint(name, model, carried)}") from None
 
 
-def joint_index(model: "Model", name: str) -> int:
+def joint_index(model: Any, name: str) -> int:
     """Index of a moving joint by name.
 
     **Raises:** ValueError for a name of no joint, or of a fixed one; names that look alike are listed.
@@ -175,14 +170,14 @@ def joint_index(model: "Model", name: str) -> int:
     raise ValueError(f"joint {name!r} is not in model {model.name!r}; {hint}")
 
 
-def coordinate_index(slices: Sequence[slice], model: "Model", joint: str) -> int | slice:
+def coordinate_index(slices: Sequence[slice], model: Any, joint: str) -> int | slice:
     """Index of a joint's coordinate, or the slice of several."""
     place = slices[joint_index(model, joint)]
     # A number and not a slice of one, so that q[index] is a scalar.
     return place.start if place.stop == place.start + 1 else place
 
 
-def velocity_indices(model: "Model", joints: Iterable[str]) -> np.ndarray:
+def velocity_indices(model: Any, joints: Iterable[str]) -> np.ndarray:
     """Indices in v of the coordinates of some joints, in their order.
 
     **Raises:** ValueError for one string instead of a list, unknown joints and joints named twice.
@@ -198,7 +193,7 @@ def velocity_indices(model: "Model", joints: Iterable[str]) -> np.ndarray:
     return np.concatenate([np.zeros(0, int), *(np.arange(place.start, place.stop) for place in places)])
 
 
-def _hint(name: str, model: "Model", carried: dict) -> str:
+def _hint(name: str, model: Any, carried: dict) -> str:
     near = difflib.get_close_matches(str(name), (*model.topology.frame_names, *carried), n=5, cutoff=0.4)
     return (
         f"did you mean {', '.join(near)}?" if near else f"frames are {', '.join(model.topology.frame_names[:10])} ..."
