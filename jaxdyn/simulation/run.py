@@ -194,7 +194,7 @@ def simulate(
     dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
     # Known numbers go to the compiled program as they are: each array of JAX made before would be a transfer of its own.
     to_array = np.asarray if concrete and not modal else jnp.asarray
-    numbers: list[Any] = [x if _is_array(x, dtype) else to_array(x, dtype) for x in arrays]
+    numbers: list[Any] = [x if isinstance(x, jax.Array) and x.dtype == dtype else to_array(x, dtype) for x in arrays]
     numbers.append(to_array(stepsize, dtype) if has_length else stepsize)
     if modal:
         solution = hybrid_motion(scene, control, numbers, options)
@@ -224,10 +224,6 @@ def hybrid_motion(*args) -> Solution:
     from jaxdyn.simulation.hybrid.motion import hybrid_motion
 
     return hybrid_motion(*args)
-
-
-def _is_array(x, dtype) -> bool:
-    return isinstance(x, jax.Array) and x.dtype == dtype
 
 
 def _check_numbers(scene: Scene, q0, v0, ts, rtol, atol, stepsize) -> tuple:

@@ -235,18 +235,11 @@ def _pull_step(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, af
 def _iterate_replay(plan: Plan, args, ends, replay: _Replay, read) -> Iteration:
     """Take a step again."""
     (t0, t1), kept = read
-    return _go_on(_end_of_step(plan, args, t0, t1, replay.y), ends, replay, kept)
-
-
-def _go_on(after, ends, replay: _Replay, kept) -> Iteration:
+    after = take_step(plan, args, t0, t1, replay.y, plan.first_rate(args, t0, replay.y)).projected
     first, last = ends
     step = replay.places[0]
     state = _Replay(jnp.where(kept, after, replay.y), replay.places + 1)
     return Iteration(state, step < last, step + 1 < last, None, step - first, (replay.y,))
-
-
-def _end_of_step(plan: Plan, args, t0, t1, y):
-    return take_step(plan, args, t0, t1, y, plan.first_rate(args, t0, y)).projected
 
 
 def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
