@@ -172,7 +172,7 @@ class _Hasher:
             data = part if isinstance(part, bytes) else repr(part).encode()
             self.hash.update(len(data).to_bytes(8, "little") + data)
 
-    def add(self, x: Any) -> None:
+    def add(self, x: object) -> None:
         """Add an object."""
         if type(x) in _PLAIN:
             self.write(type(x).__name__, x)
@@ -190,7 +190,7 @@ class _Hasher:
             # what JAX keeps, and on whether they were read from disk.
             self.write(before or self.hash_of(x))
 
-    def hash_of(self, x: Any) -> bytes:
+    def hash_of(self, x: object) -> bytes:
         """Hash of an object's contents."""
         outer, self.hash = self.hash, hashlib.sha256()
         self.added[id(x)], self.depth = self.depth, self.depth + 1

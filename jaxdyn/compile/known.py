@@ -20,7 +20,7 @@ def is_concrete(*trees) -> bool:
     return not any([isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees)])
 
 
-def as_numpy_if_known(array: Any) -> Any:
+def as_numpy_if_known(array: object) -> Any:
     """Convert a leaf with known values to numpy; a traced leaf is returned unchanged."""
     # Numpy operations on known numbers run at trace time, so their zeros are dropped before anything is compiled.
     return np.asarray(array) if array is not None and is_concrete(array) else array

@@ -197,7 +197,7 @@ def _first(values) -> Any:
     return values if np.ndim(values) == 0 else values[0]
 
 
-def check_search(steps: Any, guesses: Any, atol: Any) -> None:
+def check_search(steps: object, guesses: object, atol: object) -> None:
     """Check the extent of a search for a configuration, and its tolerance. **Raises:** ValueError."""
     check_count(steps, "steps")
     check_count(guesses, "guesses")

@@ -130,7 +130,7 @@ def foot(
     return Foot(frame, cone, pose_leaf(pose, f"foot {frame!r}: pose"), jnp.asarray(rotation, float))
 
 
-def check_feet(model: Any, feet: Any) -> tuple[Foot, ...]:
+def check_feet(model: object, feet: object) -> tuple[Foot, ...]:
     """Check the feet of a model. **Raises:** ValueError for other types, unknown frames and repeated ones."""
     if not isinstance(model, Model):
         raise ValueError(f"model is a {type(model).__name__}, which has no bodies; pass a Model")

@@ -73,7 +73,7 @@ class PiecewiseForce(eqx.Module):
         return self.force(system, q, v, t, self.guards(system, q, v, t) > 0)
 
 
-def has_pieces(force: Any) -> bool:
+def has_pieces(force: object) -> bool:
     """Decide whether a force has switching functions."""
     return isinstance(force, PiecewiseForce) or hasattr(force, "effort_guards")
 

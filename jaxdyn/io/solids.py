@@ -261,7 +261,7 @@ class Collision(NamedTuple):
     key: Any = None
 
 
-def check_choice(contacts: Any) -> str | tuple[str, ...] | dict[str, int] | None:
+def check_choice(contacts: object) -> str | tuple[str, ...] | dict[str, int] | None:
     """Check the option `contacts` of a reader. **Raises:** ValueError."""
     if contacts is None or (isinstance(contacts, str) and contacts == "ground"):
         return contacts

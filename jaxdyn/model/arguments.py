@@ -105,7 +105,7 @@ def zeros_if_none(value: Any, size: int) -> Any:
     return np.zeros(size) if value is None else value
 
 
-def as_path(path: Any, name: str = "path") -> pathlib.Path:
+def as_path(path: object, name: str = "path") -> pathlib.Path:
     """Convert a path argument, `~` expanded.
 
     **Raises:** ValueError for a value that is no path.
@@ -117,14 +117,14 @@ def as_path(path: Any, name: str = "path") -> pathlib.Path:
     return pathlib.Path(path).expanduser()
 
 
-def check_name(name: Any, what: str) -> str:
+def check_name(name: object, what: str) -> str:
     """Check that something is named by a string. **Raises:** ValueError."""
     if not isinstance(name, str):
         raise ValueError(f"{what} is {name!r}; give its name, a string")
     return name
 
 
-def check_names(names: Any, what: str) -> tuple[str, ...]:
+def check_names(names: object, what: str) -> tuple[str, ...]:
     """Tuple of names, of one name or several. **Raises:** ValueError for anything else."""
     if isinstance(names, str):
         return (names,)
@@ -133,12 +133,12 @@ def check_names(names: Any, what: str) -> tuple[str, ...]:
     return tuple(check_name(name, what) for name in names)
 
 
-def check_body(name: Any, what: str) -> str | None:
+def check_body(name: object, what: str) -> str | None:
     """Check that a body or frame is named by a string, or is the world, None. **Raises:** ValueError."""
     return None if name is None else check_name(name, what)
 
 
-def check_new_name(name: Any, default: str, what: str = "name") -> str:
+def check_new_name(name: object, default: str, what: str = "name") -> str:
     """Check the name that a user gives to something, or take the default for None. **Raises:** ValueError."""
     if name is None:
         return default
@@ -147,7 +147,7 @@ def check_new_name(name: Any, default: str, what: str = "name") -> str:
     return name
 
 
-def check_flag(value: Any, what: str) -> bool:
+def check_flag(value: object, what: str) -> bool:
     """Check a choice of yes or no on which a program depends.
 
     **Raises:** ValueError for anything but True and False: to Python any object is true, "no" and NaN included.
@@ -157,7 +157,7 @@ def check_flag(value: Any, what: str) -> bool:
     return bool(value)
 
 
-def check_mapping(value: Any, what: str, example: str) -> dict[str, Any]:
+def check_mapping(value: object, what: str, example: str) -> dict[str, Any]:
     """Check a mapping from names, None for an empty one. **Raises:** ValueError that shows the example."""
     if value is not None and not isinstance(value, Mapping):
         raise ValueError(f"{what} is {value!r}; give a mapping from names, such as {example}")

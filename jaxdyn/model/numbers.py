@@ -32,7 +32,7 @@ def as_float(value: Any, what: str, shape: tuple | None = None, like=None) -> Fl
     return array
 
 
-def as_number(value: Any, what: str, unit: str = "", *, zero: bool = False, like=None) -> Float[Array, ""]:
+def as_number(value: object, what: str, unit: str = "", *, zero: bool = False, like=None) -> Float[Array, ""]:
     """Convert `value` to one positive number, or zero where that is allowed.
 
     **Raises:** ValueError for other shapes, and for known numbers below that or not finite.
@@ -57,14 +57,14 @@ def as_static(value: Any, what: str, low: Number, high: Number, fix: str) -> flo
     return float(value)
 
 
-def check_seed(value: Any, what: str = "seed") -> int:
+def check_seed(value: object, what: str = "seed") -> int:
     """Check the seed of random numbers. **Raises:** ValueError for anything but an integer of 32 bits that is not negative."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < 2**32:
         raise ValueError(f"{what} is {value!r}; give a whole number from 0 to 2^32 - 1")
     return int(value)
 
 
-def check_count(value: Any, what: str) -> int:
+def check_count(value: object, what: str) -> int:
     """Check a number of steps, samples or bodies. **Raises:** ValueError for anything but a positive integer."""
     # True is an int to Python.
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:

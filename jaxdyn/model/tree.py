@@ -222,7 +222,7 @@ def _replace(model: Model, leaves: dict) -> Model:
     return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints, rounding=rounding)
 
 
-def check_rounding(rounding: Any) -> float:
+def check_rounding(rounding: object) -> float:
     """Check the rounding of poses. **Raises:** ValueError for anything but a number from 0 to 0.01."""
     # Above that redundant rows are not distinguishable from independent ones, whatever the mechanism.
     if not isinstance(rounding, (int, float, np.number)) or not 0 <= rounding <= 1e-2:

@@ -205,7 +205,7 @@ class Worst(Reduction):
         return {"value": value, "rollout": rollout}
 
 
-def check_reductions(reductions: Any) -> dict[str, Reduction]:
+def check_reductions(reductions: object) -> dict[str, Reduction]:
     """The reductions by name.
 
     **Raises:** ValueError for anything but a dictionary of reductions, and for names that are no identifiers.

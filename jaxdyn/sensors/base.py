@@ -155,13 +155,13 @@ class Sensor(eqx.Module):
         """Refuse a scene that has not what the sensor is on. **Raises:** ValueError."""
 
 
-def check_part(part: Any, parts: dict) -> None:
+def check_part(part: object, parts: dict) -> None:
     """Check that a sensor has such a part. **Raises:** ValueError."""
     if not (part is None or isinstance(part, str)) or part not in parts:
         raise ValueError(f"part is {part!r}; choose from {', '.join(map(repr, parts))}")
 
 
-def check_sensors(scene: Scene, sensors: Any) -> tuple[Sensor, ...]:
+def check_sensors(scene: Scene, sensors: object) -> tuple[Sensor, ...]:
     """Sensors with names of their own, on a scene that has what they are on. **Raises:** ValueError."""
     if isinstance(sensors, Sensor):
         sensors = (sensors,)
@@ -243,7 +243,7 @@ def with_contacts(scene: Scene, forces: Sequence = ()) -> Scene:
     return Scene(scene.system, (*scene.constraints, *touching), forces)
 
 
-def check_contacts(scene: Scene, contacts: Any, rows: tuple[int, ...], dtype) -> Array:
+def check_contacts(scene: Scene, contacts: object, rows: tuple[int, ...], dtype) -> Array:
     """Forces of the unilateral contacts of a scene, stacked by their rows, (*rows, k); () of a scene without.
 
     **Raises:** ValueError for contacts whose forces are missing, unknown names and shapes that do not fit.
@@ -263,7 +263,7 @@ def check_contacts(scene: Scene, contacts: Any, rows: tuple[int, ...], dtype) ->
     return jnp.concatenate(parts, -1)
 
 
-def check_thrusts(scene: Scene, thrusts: Any, shape: tuple[int, ...], dtype: DType) -> dict[str, Array]:
+def check_thrusts(scene: Scene, thrusts: object, shape: tuple[int, ...], dtype: DType) -> dict[str, Array]:
     """Check wrenches by the names of frames. **Raises:** ValueError for unknown frames, and for another shape."""
     given = check_mapping(thrusts, "thrusts", '{"propeller": wrench}')
     for frame in given:

@@ -152,7 +152,7 @@ def as_control(control: Control) -> Any:
     return as_pytree(control, "control")
 
 
-def check_steps(control: Control, stepsize: Any) -> None:
+def check_steps(control: Control, stepsize: object) -> None:
     """Refuse steps that do not fit a sampled law: adaptive ones, and those that do not fill a period."""
     if not isinstance(control, Sampled):
         return
