@@ -228,7 +228,7 @@ def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"
 
 
 def drop_rounding(left: Array, whole: Array) -> Array:
-    """What a projection leaves of rows, or zeros where that is rounding of the whole rows."""
+    """Replace the projected rows `left` by zeros where they are no larger than the rounding errors of the rows `whole`."""
     # A decision on rank has no derivative.
     sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, whole)]
     return jnp.where(sizes[0] > tolerance(None, whole) ** 2 * sizes[1], left, jnp.zeros_like(left))

@@ -269,9 +269,9 @@ def check_choice(contacts: object) -> str | tuple[str, ...] | dict[str, int] | N
         for name, lowest in contacts.items():
             check_count(lowest, f"contacts[{name!r}]")
         return dict(contacts)
-    names = tuple(contacts) if isinstance(contacts, Iterable) and not isinstance(contacts, str) else (contacts,)
+    names = tuple(contacts) if isinstance(contacts, Iterable) and not isinstance(contacts, str) else (None,)
     known = tuple(name for name in names if isinstance(name, str))
-    if known != names or isinstance(contacts, str):
+    if known != names:
         raise ValueError(f"contacts is {contacts!r}; give 'ground', a list of names of links that touch it, or None")
     return known
 

@@ -117,8 +117,8 @@ def test_second_derivatives_and_float32_are_those_of_the_exact_mechanism(folder)
     q, v = (jnp.zeros(3).at[order].set(y) for y in jd.scenes.four_bar.start())
     motion = jd.constrained_dynamics(single, q.astype(jnp.float32), v.astype(jnp.float32))
     assert int(motion.rank) == 2 and bool(motion.success)
-    # Cond(A M^-1 A^T) times eps of float32.
-    np.testing.assert_allclose(motion.acceleration, jd.constrained_dynamics(scene, q, v).acceleration, rtol=1e-4)
+    # Some thirty roundings of float32; the condition of A M^-1 A^T is 1.7.
+    np.testing.assert_allclose(motion.acceleration, jd.constrained_dynamics(scene, q, v).acceleration, rtol=1e-5)
 
 
 @pytest.mark.long
