@@ -41,8 +41,16 @@ def convert(expansion, params, args, eqn):
 
 
 def _as_dtype(expansion, x: np.ndarray, dtype) -> np.ndarray:
+    dtype = np.dtype(dtype)
+    if x.dtype.kind != "O" and (x.dtype.kind != "f" or dtype.kind not in "iu"):
+        return x.astype(dtype)
     if x.dtype.kind != "O":
-        return convert_known(x, dtype)
+        # As XLA: floats that no integer is near become its ends, or zero if they are none. NumPy's own conversion of a float
+        # that is out of range is undefined and differs between processors.
+        ends = np.iinfo(dtype)
+        is_low, is_high = x <= ends.min, x >= ends.max
+        inside = np.where(is_low | is_high | np.isnan(x), 0, x).astype(dtype)
+        return np.where(is_high, dtype.type(ends.max), np.where(is_low, dtype.type(ends.min), inside))
     kind = kind_or_refuse(dtype)
     if all([type(y) is Number and y.kind == kind for y in x.ravel().tolist()]):
         return x
@@ -238,18 +246,6 @@ def empty_reduction(name: str, dtype):
         ends = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
         return ends[name == "reduce_min"]
     return name in ("reduce_prod", "reduce_and")
-
-
-def convert_known(x: np.ndarray, dtype) -> np.ndarray:
-    """An array as one of a dtype, by XLA's rules: floats that no integer is near become its ends, or zero if they are none."""
-    dtype = np.dtype(dtype)
-    if x.dtype.kind != "f" or dtype.kind not in "iu":
-        return x.astype(dtype)
-    # NumPy's own conversion of a float that is out of range is undefined and differs between processors.
-    ends = np.iinfo(dtype)
-    is_low, is_high = x <= ends.min, x >= ends.max
-    inside = np.where(is_low | is_high | np.isnan(x), 0, x).astype(dtype)
-    return np.where(is_high, dtype.type(ends.max), np.where(is_low, dtype.type(ends.min), inside))
 
 
 def evaluate_known(eqn, args) -> np.ndarray:

@@ -20,7 +20,7 @@ from jaxdyn.compile.code import find_slots
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, eval_jaxpr, function_of, is_zero, vary_alike
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.compile.mode import has_branches, in_rows, is_careful, is_expanding, is_standalone
-from jaxdyn.compile.rules import mark_floats
+from jaxdyn.compile.rules import is_float, mark_invalid
 from jaxdyn.compile.scan import is_chain
 
 T = TypeVar("T")
@@ -77,7 +77,8 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
     if goes_on(state) is True:
         state, most = step(state), most - 1
     if not has_branches() and (marks or not is_standalone()) and not is_careful():
-        return mark_floats(goes_on(state), state)
+        flag = goes_on(state)
+        return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, state)
     if has_branches() and most > MOST_WRITTEN_OUT:
         return _loop(goes_on, step, state, most)
     for _ in range(most):

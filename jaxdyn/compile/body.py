@@ -48,14 +48,13 @@ class Body:
         """Name of operation i; inputs are loaded where they are first read."""
         if self.names[i] is None:
             op, kind, args = self.program.operations[i]
-            self.names[i] = self._load_part(args[0], args[1], kind) if op == "part" else self.load(*args, kind)
+            if op != "part":
+                self.names[i] = self.load(*args, kind)
+            else:
+                call, (entry,) = args
+                first, pointer = next((k, p) for k, p, array in self.in_memory[call] if k <= entry < k + array.size)
+                self.names[i] = self.e.load_at(pointer, entry - first, kind)
         return self.names[i]
-
-    def _load_part(self, call: int, entry: Constant, kind: str) -> str:
-        for first, pointer, array in self.in_memory[call]:
-            if first <= entry.value < first + array.size:
-                return self.e.load_at(pointer, entry.value - first, kind)
-        raise AssertionError("a part beyond the results of a call")
 
     def text(self, x, kind: str) -> str:
         """An entry: a name or a constant."""
@@ -122,7 +121,9 @@ class Body:
             self.regions[called] = at
         for array in called.inputs:
             entries = given[first : first + array.size]
-            pointer = self._input_pointer(entries, array)
+            # An input of this program, or an output of a loop, that these entries are is passed on.
+            place = whole_input(self.program, entries, array)
+            pointer = self.pointer_to(entries, array) if place is None else self.array(place)
             pointers.append(pointer or self._copy_entries(entries, array, at))
             # Of a loop, whose arrays are large and used by one call, what is passed on has no place of its own.
             at += 0 if has_loop(called) and pointer else bytes_of(array, self.e.width)
@@ -146,11 +147,6 @@ class Body:
             results |= {first + k: self.e.load_at(pointer, k, kind) for k in range(size) if first + k in needed}
             first += size
         return results
-
-    def _input_pointer(self, entries, array: Array) -> str | None:
-        """The pointer to an input of this program, or to an output of a loop, that these entries are."""
-        place = whole_input(self.program, entries, array)
-        return self.pointer_to(entries, array) if place is None else self.array(place)
 
     def pointer_to(self, entries, array: Array) -> str | None:
         """The pointer to the output of a loop that these entries are, all of it in its order."""
@@ -179,8 +175,16 @@ class Body:
         return pointer
 
     def arrays_in_memory(self) -> list[int]:
-        """Inputs of the program that are read as arrays."""
-        return _inputs_of_loops(self.program)
+        """Inputs of the program that are passed on whole to a loop."""
+        found = set()
+        for op, _, args in self.program.operations:
+            if op == "call" and has_loop(called := self.program.subprograms[args[0].value]):
+                first = 1
+                for array in called.inputs:
+                    entries, first = args[first : first + array.size], first + array.size
+                    if len(entries) >= MIN_ENTRIES_IN_LOOP:
+                        found.add(whole_input(self.program, entries, array))
+        return sorted(found - {None})
 
     def _place(self, at: int) -> str:
         return self.e.emit(f"getelementptr i8, ptr %passed, i64 {at}")
@@ -216,19 +220,6 @@ def whole_input(program: Program, entries: Sequence, array: Array) -> int | None
     whole = [(place, k) for k in range(program.inputs[place].size)]
     same = whole == [operations[x][2] for x in entries] and program.inputs[place].dtype == array.dtype
     return place if same else None
-
-
-def _inputs_of_loops(program: Program) -> list[int]:
-    """Inputs of a program that are passed on whole to a loop."""
-    found = set()
-    for op, _, args in program.operations:
-        if op == "call" and has_loop(called := program.subprograms[args[0].value]):
-            first = 1
-            for array in called.inputs:
-                entries, first = args[first : first + array.size], first + array.size
-                if len(entries) >= MIN_ENTRIES_IN_LOOP:
-                    found.add(whole_input(program, entries, array))
-    return sorted(found - {None})
 
 
 def _find_products(program: Program) -> dict[int, int]:

@@ -175,9 +175,9 @@ class Pair(Program):
     def __init__(self, fast: Program, careful: Careful):
         self.start(fast.inputs, careful.outputs, (*fast.subprograms, careful), fast.name)
         self.fast, self.careful = fast, careful
-        self.derivative = functools.partial(_tangent_of_pair, self)
-        if fast.fallback is not None:
-            self.fallback = functools.partial(_without_flag, fast.fallback)
+        self.derivative = lambda moving: guard(derive.tangent(fast, moving), lambda: careful.tangent(moving))
+        if (fallback := fast.fallback) is not None:
+            self.fallback = lambda *flat: fallback(*flat)[:-1]  # without the flag
         self.key = key_within(fast, "pair", careful.digest) if careful.is_kept else None
 
     @functools.cached_property
@@ -235,14 +235,6 @@ class Pair(Program):
 def guard(fast: Program, careful: Callable[[], Careful]) -> Program:
     """The pair of a program and a careful one; the program itself where it does not report which samples are valid."""
     return Pair(fast, careful()) if fast.reports_validity else fast
-
-
-def _tangent_of_pair(pair: Pair, moving) -> Program:
-    return guard(derive.tangent(pair.fast, moving), lambda: pair.careful.tangent(moving))
-
-
-def _without_flag(fallback: Callable, *flat) -> list:
-    return fallback(*flat)[:-1]
 
 
 def _tangent_by_jax(base: Careful, moving, *flat) -> list:

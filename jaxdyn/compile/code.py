@@ -22,7 +22,6 @@ from jaxdyn.compile.body import (
     is_zero,
     on_heap,
     pack,
-    symbol_of,
     unpack,
     write_call,
 )
@@ -208,22 +207,6 @@ def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, a
 # the children that have been computed, and is zero before the first of them.
 
 
-def scan_ir(scan: Any, width: int) -> str:
-    """The text of the function `called` of a scan."""
-    text = _ScanText(scan, width, "called")
-    return "\n".join([text.function(), *text.e.declared.values(), *ATTRIBUTES])
-
-
-def scan_definition(scan: Any, symbol: str) -> dict[str, str]:
-    """The function for one sample, and the loops that it calls, by names in a module's text. Programs are declared."""
-    text = _ScanText(scan, 1, symbol)
-    parts = {symbol: text.function().replace("define void", "define internal void", 1)}
-    for called in scan.subprograms:
-        if (name := symbol_of(called, 1)) in text.e.declared and hasattr(called, "definition"):
-            text.e.declared |= called.definition(name)
-    return text.e.declared | parts
-
-
 def find_slots(parents: Sequence[int]) -> tuple[int, list[int]]:
     """Number of slots, and the slot of the root and then of each iteration: one is free after its last child."""
     last = {parent: i for i, parent in enumerate(parents)}
@@ -241,7 +224,9 @@ def find_slots(parents: Sequence[int]) -> tuple[int, list[int]]:
     return count, slots
 
 
-class _ScanText:
+class ScanText:
+    """The text of the function `symbol` of a scan."""
+
     def __init__(self, scan: Any, width: int, symbol: str):
         self.scan, self.width, self.symbol, self.e = scan, width, symbol, Emitter(width)
         self.consts, self.carries, self.rows, self.tables = scan.split_inputs(scan.body.inputs)

@@ -16,7 +16,6 @@ import os
 import sys
 import tempfile
 import types
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -55,14 +54,6 @@ def hash_of_sources(folder: Path) -> bytes:
         data = path.read_bytes()
         digest.update(f"{path.relative_to(folder)} {len(data)} ".encode() + data)
     return digest.digest()
-
-
-def version_of(package: str) -> str:
-    """Version of an installed package, or an empty text."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return ""
 
 
 def read(name: str) -> bytes | None:
@@ -271,7 +262,7 @@ class _Hasher:
                 self.add(item)
         elif cls in (set, frozenset):
             self.write(*sorted(fingerprint(item) for item in x))
-        elif _package(cls) in ("jax", "jaxlib") and not isinstance(x, _JAX_CLASSES):
+        elif (cls.__module__ or "").partition(".")[0] in ("jax", "jaxlib") and not isinstance(x, _JAX_CLASSES):
             raise NoFingerprint(f"an instance of {cls.__module__}.{cls.__qualname__}")
         else:
             self.add_fields(x)
@@ -311,10 +302,6 @@ class _Hasher:
                 self.write("an empty cell")
             else:
                 self.add(contents)
-
-
-def _package(x: Any) -> str:
-    return (getattr(x, "__module__", None) or "").partition(".")[0]
 
 
 def _as_tuple(slots) -> tuple[str, ...]:

@@ -26,6 +26,8 @@ _CALLS = re.compile(r"custom_call @(?:\"([^\"]*)\"|([\w.$]+))")
 _SAFE = re.compile(
     r"jaxdyn_kernel|lapack_\w+|Sharding|annotate_device_placement|TopK|Qr|ProductOfElementaryHouseholderReflectors"
 )
+# Options with which JAX checks what it runs, or runs it elsewhere.
+_CHECKS = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs", "jax_check_tracer_leaks", "jax_default_device")
 _NUMBERS = re.compile(r"program = (\d+) : i64")
 
 
@@ -73,29 +75,17 @@ def call_executable(function: Callable, args: tuple, kwargs: dict, options: Call
         else:
             # With its type: 1 and 1.0 and True are equal, and are other constants.
             kinds.append((type(x), Static(x), repr(x) if isinstance(x, float) else None))  # 0.0 and -0.0 are equal too
-    context = jax_adapter.configuration(), mode.state()
+    key = function, structure, tuple(kinds), options, (jax_adapter.configuration(), mode.state())
     try:
-        found = _executable(function, structure, tuple(kinds), options, context)
-    except _Unhashable:
+        hash(key)
+    except TypeError:
         return None
-    return found(arrays)
-
-
-class _Unhashable(Exception):
-    pass
+    return _find(*key)(arrays)
 
 
 @functools.cache
 def _default_sharding() -> Any:
     return jax.sharding.SingleDeviceSharding(jax.devices()[0])
-
-
-def _executable(*key) -> Executable:
-    try:
-        hash(key)
-    except TypeError:
-        raise _Unhashable from None
-    return _find(*key)
 
 
 @functools.lru_cache(maxsize=1024)
@@ -110,7 +100,8 @@ def _find(function, structure, kinds, options, context) -> Executable:
         def flat(*arrays):
             given = iter(arrays)
             leaves = [x[1].value if isinstance(x[1], Static) else next(given) for x in kinds]
-            found, out = jax.tree.flatten(_apply(function, structure, leaves))
+            args, kwargs = jax.tree.unflatten(structure, leaves)
+            found, out = jax.tree.flatten(function(*args, **kwargs))
             is_array = [isinstance(x, (jax.Array, np.ndarray, np.generic)) for x in found]
             results[:] = [tuple(None if y else Static(x) for x, y in zip(found, is_array, strict=True)), out]
             return [x for x, y in zip(found, is_array, strict=True) if y]
@@ -135,11 +126,6 @@ def _find(function, structure, kinds, options, context) -> Executable:
     if key is not None and is_kept:
         _save_executable(key, text, made)
     return made
-
-
-def _apply(function: Callable, structure: Any, leaves: list) -> Any:
-    args, kwargs = jax.tree.unflatten(structure, leaves)
-    return function(*args, **kwargs)
 
 
 def _load_executable(key: str, recover: Callable) -> Executable | None:
@@ -221,7 +207,7 @@ def _compile(function: Callable, options: Callable) -> Callable:
         if is_tracing():
             return function(*args, **kwargs)
         is_glue = _is_glue(jax.default_backend())
-        if is_glue and _is_plain_call():
+        if is_glue and not any(getattr(jax.config, name) for name in _CHECKS):
             found = call_executable(function, args, kwargs, options)
             if found is not None:
                 return found
@@ -235,12 +221,6 @@ def _compile(function: Callable, options: Callable) -> Callable:
 
 def _usual_options() -> None:
     """XLA's own options, for functions that are more than calls of kernels."""
-
-
-def _is_plain_call() -> bool:
-    """Decide whether JAX is to run what it has compiled, without checks within the call."""
-    options = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs", "jax_check_tracer_leaks", "jax_default_device")
-    return not any(getattr(jax.config, name) for name in options)
 
 
 _jit: Any = eqx.filter_jit

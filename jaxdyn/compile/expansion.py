@@ -188,7 +188,13 @@ class _Expansion:
         program, has_rules = _subprogram(inner, known, self.graph.most)
         self.has_rules |= has_rules
         program, places = without_unread(program)
-        given = [_split_entries(x, y) for x, y in zip(args, known, strict=True) if not isinstance(y, bytes)]
+        given = []
+        for x, of_x in zip(args, known, strict=True):
+            if isinstance(of_x, tuple):
+                entries = [y for y, z in zip(x.ravel().tolist(), of_x, strict=True) if z is None]
+                given.append(objects(entries, (len(entries),)))
+            elif of_x is None:
+                given.append(x)
         return program, [given[i] for i in places]
 
     def _repair(self, results: list, program: Program, again, args) -> list:
@@ -204,9 +210,6 @@ class _Expansion:
             program.derived["careful", again] = again.beside(program)
         careful = program.derived["careful", again]
         return self.graph.call_where(flagged.item(), careful, [*map(as_objects, args)], results)
-
-    def _guard(self, params, args, eqn):
-        return self._call(params["call"], args, params["again"])
 
     def _reduce(self, name, array, axes, out):
         # Entries in XLA's order, one after the other: a sum of few numbers, whose order decides the rounding.
@@ -245,9 +248,6 @@ class _Expansion:
         is_small = g.compare("lt", g.function("abs", x), 0.5)
         return g.select(is_small, g.mul(g.add(1.0, x), g.sub(1.0, x)), g.sub(1.0, g.mul(x, x)), x.kind)
 
-    def _same(self, params, args, eqn):
-        return args
-
     def _high(self, params, args, eqn):
         """A function that JAX keeps whole, such as searchsorted from version 0.12 on."""
         expand_whole, tree, has_rule = jax_adapter.expand_high(params)
@@ -274,16 +274,13 @@ class _Expansion:
 
     def _cond(self, params, args, eqn):
         which, branches = as_objects(args[0]).item(), params["branches"]
-        if type(which) is Number:
-            if not self.branches or len(branches) != 2:
-                raise NotNumbers("a cond whose branch is not known")
-            return self._branch(which, branches[0], branches[1], args[1:])
-        return self.evaluate(branches[min(max(int(which), 0), len(branches) - 1)], args[1:])
-
-    def _branch(self, which, usual: ClosedJaxpr, rare: ClosedJaxpr, args) -> list:
-        """The results of `usual`, or where `which` is not 0 those of `rare`, a subprogram that hardly any sample calls."""
-        otherwise = [as_objects(x) for x in self.evaluate(usual, args)]
-        rare, rare_args, again, args = _innermost(rare, args, None, args)
+        if type(which) is not Number:
+            return self.evaluate(branches[min(max(int(which), 0), len(branches) - 1)], args[1:])
+        if not self.branches or len(branches) != 2:
+            raise NotNumbers("a cond whose branch is not known")
+        # The second one is a subprogram, which hardly any sample calls.
+        otherwise = [as_objects(x) for x in self.evaluate(branches[0], args[1:])]
+        rare, rare_args, again, args = _innermost(branches[1], args[1:], None, args[1:])
         program, given = self._subprogram(rare, rare_args)
         if program.flags:
             otherwise.append(objects([False], ()))
@@ -361,25 +358,16 @@ def _find_known_entries(x: np.ndarray) -> bytes | tuple | None:
     if x.dtype.kind != "O":
         return f"{x.dtype.str} ".encode() + x.tobytes()
     # Other known numbers are passed: a function that is called with several of them is compiled once.
-    entries = tuple(
-        [None if type(y) is Number or y not in (0, 1, -1) else _write_number(y) for y in x.ravel().tolist()]
+    entries = [None if type(y) is Number or y not in (0, 1, -1) else y for y in x.ravel().tolist()]
+    # As texts, which tell zeros of both signs apart.
+    texts = tuple(
+        [None if y is None else "-0" if y == 0 and math.copysign(1.0, y) < 0 else str(int(y)) for y in entries]
     )
-    return entries if any(y is not None for y in entries) else None
-
-
-def _write_number(x) -> str:
-    return "-0" if x == 0 and math.copysign(1.0, x) < 0 else str(int(x))
-
-
-def _split_entries(x: np.ndarray, known: tuple | None) -> np.ndarray:
-    """The entries that `_find_known_entries` does not know."""
-    if known is None:
-        return x
-    return objects(given := [y for y, z in zip(x.ravel().tolist(), known, strict=True) if z is None], (len(given),))
+    return texts if any(y is not None for y in texts) else None
 
 
 def _join_entries(x: np.ndarray, known: tuple | None, array: Array) -> np.ndarray:
-    """The inverse of `_split_entries`."""
+    """An array of entries that are given, and of those that `_find_known_entries` knows."""
     if known is None:
         return x
     kind, unknown = kind_or_refuse(array.dtype), iter(x.tolist())
@@ -425,9 +413,7 @@ _INNER = {
     "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr",
 }  # fmt: skip
 _OTHER: dict[str, Callable] = {
-    "copy": _Expansion._same,
-    "optimization_barrier": _Expansion._same,
-    "pvary": _Expansion._same,
+    **dict.fromkeys(("copy", "optimization_barrier", "pvary"), lambda self, params, args, eqn: args),
     "convert_element_type": array_rules.convert,
     "integer_pow": array_rules.integer_pow,
     "select_n": array_rules.select,
@@ -452,7 +438,7 @@ _OTHER: dict[str, Callable] = {
     "jaxdyn_kernel": _Expansion._kernel,
     "jaxdyn_invalid": _Expansion._invalid,
     "jaxdyn_nan_where": _Expansion._nan_where,
-    "jaxdyn_guarded": _Expansion._guard,
+    "jaxdyn_guarded": lambda self, params, args, eqn: self._call(params["call"], args, params["again"]),
 }
 
 # The arrays before the places.

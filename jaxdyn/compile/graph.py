@@ -116,10 +116,6 @@ class Graph:
         """The flag of a "call_where" and the entries of its inputs."""
         return number.args[1 : 2 + sum(array.size for array in self.subprograms[number.args[0]].inputs)]
 
-    def _otherwise(self, number: Number) -> tuple:
-        """Entries that stand for the outputs of a "call_where"."""
-        return number.args[1 + len(self._inputs_of_branch(number)) :]
-
     def add(self, a, b):
         """a + b."""
         if type(a) is not Number:
@@ -304,8 +300,11 @@ class Graph:
         """`if_true` where `which` is, else `if_false`."""
         if type(which) is not Number:
             return if_true if which else if_false
-        if if_false is if_true or _are_same(if_false, if_true):
+        if if_false is if_true:
             return if_true
+        if type(if_false) is not Number and type(if_true) is not Number and if_false == if_true:
+            if _is_negative(if_false) == _is_negative(if_true):  # zeros with the same sign
+                return if_true
         return self.make("select", kind, which, if_false, if_true)
 
     def convert(self, a, kind: str):
@@ -342,7 +341,7 @@ class Graph:
                 continue
             ends = [0, *itertools.accumulate(x.size for x in called.outputs)]
             flags = [any(k in parts for k in range(a, b)) for a, b in itertools.pairwise(ends)]
-            few = called.with_outputs(flags)
+            few = called.with_outputs(tuple(flags))
             if len(few.outputs) < len(called.outputs):
                 kept = [i < called.counts.carries or flag for i, flag in enumerate(flags)]
                 places = [k for i, (a, b) in enumerate(itertools.pairwise(ends)) if kept[i] for k in range(a, b)]
@@ -367,7 +366,8 @@ class Graph:
             if type(number) is Number and number.place is None:
                 number.place = -1  # needed
                 if number.op == "part" and number.args[0].op == "call_where":
-                    waiting.append(self._otherwise(number.args[0])[number.args[1]])
+                    branch, part = number.args
+                    waiting.append(branch.args[1 + len(self._inputs_of_branch(branch)) + part])
                 if number.op != "input":
                     # Of what stands for the outputs of a branch, that alone which has a part is needed.
                     waiting.extend(self._inputs_of_branch(number) if number.op == "call_where" else number.args)
@@ -419,8 +419,3 @@ def _check_kinds(number: Number) -> None:
 
 def _is_negative(x) -> bool:
     return math.copysign(1.0, x) < 0
-
-
-def _are_same(a, b) -> bool:
-    """Decide whether two known numbers are equal, zeros with the same sign."""
-    return type(a) is not Number and type(b) is not Number and a == b and _is_negative(a) == _is_negative(b)

@@ -73,8 +73,29 @@ class PseudoInverse(MatrixProgram):
         n, m = max(rows, columns), min(rows, columns)
         # Columns of the matrix, or its rows where there are fewer of them, one after the other.
         U, J = _orthogonalise(w, matrix, n, m, *((1, columns) if rows >= columns else (columns, 1)))
+        # Entry (i, k) of J D U^T is at i of_column + k of_row.
         of_column, of_row = (n, 1) if rows >= columns else (1, m)
-        _write_inverse(w, U, J, result, n, m, self.tolerance, of_column, of_row)
+        b, zero = w.b, w.integer(0)
+        sizes, largest = w.buffer(m), w.variable(w.float, w.number(0))
+        with w.loop(zero, w.integer(m)) as p:
+            x = w.at(U, (p, n))
+            square = w.product(x, x, n)
+            b.store(square, w.at(sizes, (p, 1)))
+            so_far = w.load(largest)
+            # Written so that NaN becomes the largest, and no column is dropped for a comparison with it.
+            b.store(b.select(b.fcmp_ordered("<", square, so_far), so_far, square), largest)
+        limit = b.fmul(w.number(self.tolerance**2), w.load(largest))
+        with w.loop(zero, w.integer(n * m)) as k:
+            b.store(w.number(0), w.at(result, (k, 1)))
+        with w.loop(zero, w.integer(m)) as p:
+            square = w.load(w.at(sizes, (p, 1)))
+            # What is not a number is not dropped, so that it is seen in the result.
+            with b.if_then(b.not_(b.fcmp_ordered("<=", square, limit))):
+                with w.loop(zero, w.integer(m)) as i:
+                    weight = b.fdiv(w.load(w.at(J, (p, m), (i, 1))), square)
+                    with w.loop(zero, w.integer(n)) as k:
+                        at = w.at(result, (i, of_column), (k, of_row))
+                        b.store(b.fadd(w.load(at), b.fmul(weight, w.load(w.at(U, (p, n), (k, 1))))), at)
 
     def compute(self, matrix):
         """The same by JAX's singular value decomposition."""
@@ -258,12 +279,7 @@ def _orthogonalise(w: LoopWriter, matrix, n: int, m: int, of_vector: int, of_ent
         with w.loop(zero, w.integer(m)) as k:
             one = w.b.select(w.b.icmp_signed("==", p, k), w.number(1), w.number(0))
             w.b.store(one, w.at(J, (p, m), (k, 1)))
-    _sweeps(w, U, J, n, m)
-    return U, J
-
-
-def _sweeps(w: LoopWriter, U, J, n: int, m: int) -> None:
-    """Rotate pairs of columns until all are orthogonal to rounding."""
+    # Rotate pairs of columns until all are orthogonal to rounding.
     b, one = w.b, w.number(1)
     eps = float(np.finfo(w.dtype).eps)
     going = w.variable(ir.IntType(1), ir.Constant(ir.IntType(1), 1))
@@ -285,31 +301,7 @@ def _sweeps(w: LoopWriter, U, J, n: int, m: int) -> None:
                 s = b.fmul(c, t)
                 w.rotate(x, y, c, s, n)
                 w.rotate(w.at(J, (p, m)), w.at(J, (q, m)), c, s, m)
-
-
-def _write_inverse(w: LoopWriter, U, J, inverse, n: int, m: int, tolerance: float, of_column: int, of_row: int) -> None:
-    """J D U^T, entry (i, k) at i of_column + k of_row."""
-    b, zero = w.b, w.integer(0)
-    sizes, largest = w.buffer(m), w.variable(w.float, w.number(0))
-    with w.loop(zero, w.integer(m)) as p:
-        x = w.at(U, (p, n))
-        square = w.product(x, x, n)
-        b.store(square, w.at(sizes, (p, 1)))
-        so_far = w.load(largest)
-        # Written so that NaN becomes the largest, and no column is dropped for a comparison with it.
-        b.store(b.select(b.fcmp_ordered("<", square, so_far), so_far, square), largest)
-    limit = b.fmul(w.number(tolerance * tolerance), w.load(largest))
-    with w.loop(zero, w.integer(n * m)) as k:
-        b.store(w.number(0), w.at(inverse, (k, 1)))
-    with w.loop(zero, w.integer(m)) as p:
-        square = w.load(w.at(sizes, (p, 1)))
-        # What is not a number is not dropped, so that it is seen in the result.
-        with b.if_then(b.not_(b.fcmp_ordered("<=", square, limit))):
-            with w.loop(zero, w.integer(m)) as i:
-                weight = b.fdiv(w.load(w.at(J, (p, m), (i, 1))), square)
-                with w.loop(zero, w.integer(n)) as k:
-                    at = w.at(inverse, (i, of_column), (k, of_row))
-                    b.store(b.fadd(w.load(at), b.fmul(weight, w.load(w.at(U, (p, n), (k, 1))))), at)
+    return U, J
 
 
 # --- pseudo-inverses (Y^T Y)^-1 Y^T of regular matrices by loops over rows of vectors, whose code does not grow with the matr---

@@ -113,8 +113,11 @@ def _bind(function, static, tree, args, fallback, **how) -> Any:
         return None
     # A kernel takes flat arrays. Under a trace reshapes are free.
     changes_shapes = any(x.ndim != 1 for x in leaves) or any(len(x.shape) != 1 for x in program.outputs)
-    results = (_call_under_jit if changes_shapes and is_known(leaves) else call_program)(program, leaves)
-    return jax.tree.unflatten(out_structure, results)
+    if not (changes_shapes and is_known(leaves)):
+        return jax.tree.unflatten(out_structure, call_program(program, leaves))
+    # Outside of a trace every reshape would be a program of XLA of its own.
+    with jax.disable_jit(False):
+        return jax.tree.unflatten(out_structure, _jit_call(program)(*leaves))
 
 
 def call_program(program, leaves) -> list:
@@ -124,12 +127,6 @@ def call_program(program, leaves) -> list:
         x if len(array.shape) == 1 else x.reshape(array.shape)
         for x, array in zip(results, program.outputs, strict=True)
     ]
-
-
-def _call_under_jit(program, leaves) -> list:
-    """`call_program` for known numbers: outside of a trace every reshape would be a program of XLA of its own."""
-    with jax.disable_jit(False):
-        return _jit_call(program)(*leaves)
 
 
 @functools.lru_cache(maxsize=1024)

@@ -72,13 +72,11 @@ class _Leaves:
         return len(self.leaves) == len(other.leaves) and all(map(_is_same, self.leaves, other.leaves))
 
     def __hash__(self):
-        return hash(tuple(map(_hash_of, self.leaves)))
-
-
-def _hash_of(leaf) -> int:
-    if isinstance(leaf, np.ndarray):
-        return hash(leaf.shape)
-    return hash(leaf) if type(leaf) in _PLAIN else id(leaf)
+        arrays = [leaf.shape if isinstance(leaf, np.ndarray) else None for leaf in self.leaves]
+        others = [
+            leaf if type(leaf) in _PLAIN else id(leaf) for leaf, x in zip(self.leaves, arrays, strict=True) if x is None
+        ]
+        return hash((*arrays, *others))
 
 
 def _is_same(mine, theirs) -> bool:

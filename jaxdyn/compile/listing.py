@@ -96,7 +96,9 @@ class Listing(Body):
             if op in ("call", "call_where"):
                 self._call(i, op == "call_where", *args)
             elif op == "part":
-                self._place_part(i, *args)
+                call, (entry,) = args
+                if (call, entry) in self.parts_at:
+                    self.at[i] = self.parts_at[call, entry]
             elif op != "input" and i not in self.merged:
                 self._add(i, op, kind, args)
             for k in dying[i]:
@@ -144,7 +146,8 @@ class Listing(Body):
                 arrays = called.inputs if op == "call" else (*called.inputs, *called.outputs)
                 self._constants_of(given, arrays)
         self._constants_of(itertools.chain(*self.program.results), self.program.outputs)
-        data = b"".join(_bytes(value, kind, self.e.width) for kind, value in self.constants)
+        # Each for W samples, in the 8 W bytes of a number.
+        data = b"".join((value * self.e.width).ljust(8 * self.e.width, b"\0") for _, value in self.constants)
         if data:
             e = self.e
             self.data = f"@constants{len(e.declared)}"
@@ -180,10 +183,6 @@ class Listing(Body):
                 self.at[i] = first + entry * step
                 if pointer is None:
                     e.store_at(self._pointer(self.at[i]), 0, kind, self.load(place, entry, kind))
-
-    def _place_part(self, i: int, call: int, entry: Constant) -> None:
-        if (call, entry.value) in self.parts_at:
-            self.at[i] = self.parts_at[call, entry.value]
 
     def _pointer(self, place: int) -> str:
         return self.e.emit(f"getelementptr i8, ptr %numbers, i64 {place}")
@@ -393,11 +392,6 @@ class _Memory:
     def free(self, place: int, size: int) -> None:
         """Let a place be used again."""
         self.unused.setdefault(size, []).append(place)
-
-
-def _bytes(value: bytes, kind: str, width: int) -> bytes:
-    """A constant for W samples, in the 8 W bytes of a number."""
-    return (value * width).ljust(8 * width, b"\0")
 
 
 def _data(name: str, data: bytes) -> str:

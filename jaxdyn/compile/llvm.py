@@ -276,7 +276,15 @@ class Emitter:
         self.declared["far"] = '!0 = !{!"branch_weights", i32 1, i32 1000000}'
         self.lines += [f"  br i1 {self.any(is_far)}, label %{far}, label %{after}, !prof !0", f"{far}:"]
         pair = f"{{{of}, {of}}}"
-        both = self.emit(f"call {pair} @{self._far_pair(kind)}({of} {x})")
+        # A function of this module, by the C library.
+        name, inner = f"far_pair_{kind}_{self.width}", Emitter(self.width)
+        of_library = [inner.library(function, kind, "%x") for function in ("sin", "cos")]
+        first = inner.emit(f"insertvalue {pair} poison, {of} {of_library[0]}, 0")
+        both = inner.emit(f"insertvalue {pair} {first}, {of} {of_library[1]}, 1")
+        head = f"define internal {pair} @{name}({of} %x) noinline cold nounwind {{"
+        self.declared |= inner.declared
+        self.declared[name] = "\n".join([head, *inner.lines, f"  ret {pair} {both}", "}"])
+        both = self.emit(f"call {pair} @{name}({of} {x})")
         exact = [self.emit(f"extractvalue {pair} {both}, {k}") for k in (0, 1)]
         chosen = [self.emit(f"select {flags} {is_far}, {of} {a}, {of} {b}") for a, b in zip(exact, near, strict=True)]
         self.lines += [f"  br label %{after}", f"{after}:"]
@@ -284,17 +292,6 @@ class Emitter:
             self.emit(f"phi {of} [ {a}, %{before} ], [ {b}, %{far} ]") for a, b in zip(near, chosen, strict=True)
         )
         return sine, cosine
-
-    def _far_pair(self, kind: str) -> str:
-        """Name of a function of this module for the sine and cosine of any angle, by the C library."""
-        name, of, inner = f"far_pair_{kind}_{self.width}", self.type(kind), Emitter(self.width)
-        sine, cosine = (inner.library(function, kind, "%x") for function in ("sin", "cos"))
-        first = inner.emit(f"insertvalue {{{of}, {of}}} poison, {of} {sine}, 0")
-        both = inner.emit(f"insertvalue {{{of}, {of}}} {first}, {of} {cosine}, 1")
-        head = f"define internal {{{of}, {of}}} @{name}({of} %x) noinline cold nounwind {{"
-        self.declared |= inner.declared
-        self.declared[name] = "\n".join([head, *inner.lines, f"  ret {{{of}, {of}}} {both}", "}"])
-        return name
 
     def any(self, flags: str) -> str:
         """Reduce flags: true where one is set in any element."""

@@ -224,10 +224,11 @@ class LoopText:
         e.lines.append("row:")
         dense = [[results[i] for i in self.entries[out]] for out in jax.tree.leaves(turn.dense)]
 
+        # The arguments are registers: none can be passed on as a pointer.
         def load(place, entry, kind):
             return time if place == 0 else dense[place - 1][entry]
 
-        written = [name for row in Body(e, self.loop.row, load, _no_array).results() for name in row]
+        written = [name for row in Body(e, self.loop.row, load, lambda place: None).results() for name in row]
         for element in range(self.width):
             self._write_if(self._element(passed, element, "b1"), element, places[element], [(self.rows_after, written)])
         one = e.emit(f"zext {flag} {passed} to {e.type('i4')}")
@@ -260,7 +261,3 @@ class LoopText:
             scalar = Emitter(1).type(kind)
             total = self.e.emit(f"insertelement {of} {total}, {scalar} {value}, i32 {element}")
         return total
-
-
-def _no_array(place: int) -> None:
-    """The arguments of a row's program are registers: none can be passed on as a pointer."""

@@ -111,21 +111,18 @@ def _run_by_jax(task: Task, tree, constants, given: Given, carry: Carry) -> Carr
         read = tuple(table[carry.state.places[i]] for i, table in enumerate(given.tables))
         after = turn(*task.static, tree, constants, carry.state, read)
         state = jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, carry.state)
-        write = partial(_write_record, after.index, after.active)
-        records = tuple(map(write, carry.records, after.written, task.strides))
+        records = []
+        for record, row, stride in zip(carry.records, after.written, task.strides, strict=True):
+            # Once in as many iterations as the stride. Other rows are written beyond the end, where XLA drops them.
+            asked = after.active & (after.index % stride == 0)
+            place = jnp.where(asked, after.index // stride, record.shape[0])
+            records.append(record.at[place].set(row, mode="drop"))
         saved, rows = carry.saved, carry.rows
         if of_row is not None:
             saved, rows = _write_rows(partial(of_row, *task.of_row, None), after, given.times, saved, rows)
-        return after.active & after.more, Carry(state, saved, rows, records)
+        return after.active & after.more, Carry(state, saved, rows, tuple(records))
 
     return lax.while_loop(lambda running: any_sample(running[0]), iterate, (jnp.asarray(True), carry))[1]
-
-
-def _write_record(index, active, record, row, stride: int):
-    """Write the row of an iteration, once in as many as the stride."""
-    # Rows that are not asked for are written beyond the end of the array, where XLA drops them.
-    asked = active & (index % stride == 0)
-    return record.at[jnp.where(asked, index // stride, record.shape[0])].set(row, mode="drop")
 
 
 def _write_rows(row: Callable, after: Iteration, times, saved, rows):
@@ -251,6 +248,4 @@ class Loop:
 
 
 # The same loop for the same programs: a primitive's parameters are keys of JAX's caches.
-@functools.lru_cache(maxsize=256)
-def _loop(task: Task, turn: Program, row, structure, known: Known, count: int, form: _Form) -> Loop:
-    return Loop(task, turn, row, structure, known, count, form)
+_loop = functools.lru_cache(maxsize=256)(Loop)

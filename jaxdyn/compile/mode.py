@@ -183,16 +183,11 @@ def _options() -> str:
 
 
 def say_once(message: str, subject: str = "") -> None:
-    """Log a warning that has not been logged before in this process; `subject`: what it is about, as `has_said` knows it."""
+    """Log a warning that has not been logged before in this process; `subject`: what it is about."""
     _said.add(subject)
     if message not in _said:
         _said.add(message)
         logger.warning("jaxdyn: %s", message)
-
-
-def has_said(subject: str) -> bool:
-    """Decide whether a warning about a subject has been logged in this process."""
-    return subject in _said
 
 
 # --- messages on functions that have no kernel: whose they are, and what to write instead ---
@@ -223,7 +218,7 @@ def say_without_kernel(name: str, reason: str) -> None:
     cause, mark, place = reason.partition(", in ")
     if not mark:
         # A derivative is traced without the places of the function that it belongs to.
-        if not has_said(cause):
+        if cause not in _said:
             say_once(f"{name} runs on JAX's own operations: {reason}")
         return
     # By the user's function, and not by ours that call it, of which there are several.

@@ -147,17 +147,6 @@ def _keep(identity: str, made: ObjectFile) -> None:
     disk.write(name_of_file(identity), head + b"\n" + made.binary + text)
 
 
-def find_careful(digest: str) -> str | None:
-    """Identity of the code of the careful program with this digest, or None."""
-    contents = disk.read(name_of_file(f"careful {digest}"))
-    return None if contents is None else contents.decode()
-
-
-def keep_careful(digest: str, identity: str) -> None:
-    """Keep the identity of the code of a careful program."""
-    disk.write(name_of_file(f"careful {digest}"), identity.encode())
-
-
 def code_of(text: str) -> "Code":
     """The machine code of a text, from the folder or compiled now."""
     identity = hashlib.sha256(text.encode()).hexdigest()
@@ -177,10 +166,6 @@ class Code:
     def address(self, name: str) -> int:
         """Address of a function."""
         return self.engine.get_function_address(name)
-
-    def publish(self, name: str, symbol: str) -> None:
-        """Let code that is made from now on call a function by this name."""
-        add_symbol(symbol, self.address(name))
 
 
 def add_symbol(symbol: str, address: int) -> None:
@@ -217,13 +202,10 @@ def _in_short_blocks(text: str) -> str:
             last[label], count = f"short{len(function)}", 0
             function += [f"  br label %{last[label]}", f"{last[label]}:"]
         elif line == "}":
-            whole += [_ORIGIN.sub(functools.partial(_renamed, last), x) if " phi " in x else x for x in function]
+            rename = functools.partial(lambda names, origin: f", %{names.get(origin[1], origin[1])} ]", last)
+            whole += [_ORIGIN.sub(rename, x) if " phi " in x else x for x in function]
             function, last = [], {}
     return "\n".join([*whole, *function])
-
-
-def _renamed(names: dict[str, str], origin: re.Match) -> str:
-    return f", %{names.get(origin.group(1), origin.group(1))} ]"
 
 
 def compile_text(text: str, is_quick: bool = False) -> bytes:

@@ -165,7 +165,9 @@ def as_operations(*args, program: Program, rows: int = 0):
         elif op == "call_where":
             values.append(_call_careful(program, operands, values, lead))
         elif op == "call":
-            values.append(_call_loop(program, operands, values, lead))
+            called = program.subprograms[operands[0].value]  # a loop
+            arrays = as_operations(*_columns(called.inputs, operands[1:], values, lead), program=called)
+            values.append([x for array in arrays for x in jnp.moveaxis(array, -1, 0)])
         elif op == "part":
             values.append(values[operands[0]][operands[1].value])
         elif op == "convert":
@@ -184,13 +186,6 @@ def as_operations(*args, program: Program, rows: int = 0):
         entries = lax.optimization_barrier(entries) if entries else entries
         results.append(jnp.stack(entries, -1) if entries else jnp.zeros((*lead, 0), array.dtype))
     return results
-
-
-def _call_loop(program: Program, operands, values: list, lead: tuple) -> list:
-    """Entries of the results of a loop."""
-    called = program.subprograms[operands[0].value]
-    arrays = _columns(called.inputs, operands[1:], values, lead)
-    return [x for array in as_operations(*arrays, program=called) for x in jnp.moveaxis(array, -1, 0)]
 
 
 def _columns(types: Sequence, operands, values: list, lead: tuple) -> list:

@@ -45,10 +45,6 @@ def _implement(*args, program, rows):
         return _jit_kernel(program, rows)(*args)
 
 
-def _result_types(*avals, program, rows):
-    return _results_of(avals, program.outputs)
-
-
 def _batch(args, axes, *, program, rows):
     """A new leading axis for operands that vary; an operand that all samples share stays one row."""
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
@@ -79,7 +75,16 @@ def _batch(args, axes, *, program, rows):
 def _jvp(primals, tangents, *, program, rows):
     results = kernel_p.bind(*primals, program=program, rows=rows)
     moving, steps = tuple(not is_zero(x) for x in tangents), [x for x in tangents if not is_zero(x)]
-    tangent = _tangent_or_none(program, moving)
+    tangent = None  # where there is none JAX differentiates the function itself
+    try:
+        tangent = derive.tangent(program, moving)
+    except (NotNumbers, TooLong) as reason:
+        if program.fallback is None:
+            raise
+        mode.say_without_kernel(f"the derivative of {program.name}", str(reason))
+    except Exception as error:
+        if program.fallback is None or not jax_adapter.forgive(error):
+            raise
     if tangent is None:
         every = change_along(functools.partial(by_jax, program=program), primals, moving, steps)
         changes = (x for x, array in zip(every, program.outputs, strict=True) if array.dtype.kind == "f")
@@ -89,20 +94,6 @@ def _jvp(primals, tangents, *, program, rows):
     for x, array in zip(results, program.outputs, strict=True):
         out.append(next(changes) if array.dtype.kind == "f" else zero_tangent(x))
     return results, out
-
-
-def _tangent_or_none(program, moving: tuple[bool, ...]) -> Program | None:
-    """The tangent's program; None where there is none and JAX differentiates the function itself."""
-    try:
-        return derive.tangent(program, moving)
-    except (NotNumbers, TooLong) as reason:
-        if program.fallback is None:
-            raise
-        mode.say_without_kernel(f"the derivative of {program.name}", str(reason))
-    except Exception as error:
-        if program.fallback is None or not jax_adapter.forgive(error):
-            raise
-    return None
 
 
 def _transpose_program(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
@@ -196,16 +187,18 @@ def _transpose(cotangents, *operands, program, rows):
 # `jax.shard_map`, a result varies as the arguments do.
 
 
-def _results_of(avals: Sequence, arrays: Sequence) -> list:
-    """Types of the results, one sample each of `arrays`, with the batch axes and the shardings of the arguments."""
+def _result_types(*avals, program, rows) -> list:
+    """Types of the results, with the batch axes and the shardings of the arguments."""
     longest = max(avals, key=lambda x: x.ndim, default=None)
     lead = () if longest is None else longest.shape[:-1]
     if longest is None or jax_adapter.mesh_of(longest) is None:
-        return [ShapedArray((*lead, array.size), array.dtype) for array in arrays]
+        return [ShapedArray((*lead, array.size), array.dtype) for array in program.outputs]
     # Operands with the batch's axes agree along them, or leave an axis open: the first that says something decides.
     specs = [jax_adapter.spec_of(x) for x in avals if x.ndim == longest.ndim]
     along = [next((spec[k] for spec in specs if spec[k] is not None), None) for k in range(len(lead))]
-    return [jax_adapter.type_like(longest, (*lead, array.size), array.dtype, (*along, None)) for array in arrays]
+    return [
+        jax_adapter.type_like(longest, (*lead, array.size), array.dtype, (*along, None)) for array in program.outputs
+    ]
 
 
 def _is_divisible(avals: Sequence, lead: Sequence) -> bool:
@@ -392,8 +385,12 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     # Below this a second call costs more than the batch saves; for one sample nothing is saved at all.
     if saved < MIN_SHARED_OPERATIONS:
         return None
+    # Shared operations that the second program reads or returns, in the order in which it reads them.
+    read = [args for i, (op, _, args) in enumerate(program.operations) if not is_shared[i] and op != "input"]
+    passed: dict[int, None] = {}
+    for args in (*read, *program.results):
+        passed |= {x: None for x in args if type(x) is not Constant and is_shared[x]}
     # One array for each kind of number, not one per number: the runtime handler checks every argument of a kernel.
-    passed = _interface(program, is_shared)
     kinds = sorted({program.operations[i][1] for i in passed})
     by_kind = [[i for i in passed if program.operations[i][1] == kind] for kind in kinds]
     arrays = [Array((len(entries),), dtype_of(kind)) for kind, entries in zip(kinds, by_kind, strict=True)]
@@ -448,12 +445,3 @@ class _Renumbering:
     def args(self, args) -> tuple:
         """Operands with their new indices."""
         return tuple(x if type(x) is Constant else self.index[x] for x in args)
-
-
-def _interface(program: Program, is_shared: Sequence[bool]) -> list[int]:
-    """Shared operations that the second program reads or returns, in the order in which it reads them."""
-    read = [args for i, (op, _, args) in enumerate(program.operations) if not is_shared[i] and op != "input"]
-    numbers: dict[int, None] = {}
-    for args in (*read, *program.results):
-        numbers |= {x: None for x in args if type(x) is not Constant and is_shared[x]}
-    return list(numbers)

@@ -94,6 +94,10 @@ class Program:
         # Derivatives, transposes and kernels of this program, which live as long as it does.
         self.derived: dict = {}
 
+    def __reduce__(self):
+        # What a file keeps of the body of a loop (see `scan`): neither derivatives nor what was derived.
+        return Program, (self.inputs, self.outputs, self.operations, self.results, self.subprograms)
+
     def __repr__(self):
         return f"Program({self.name or 'unnamed'}, {self.cost} operations)"
 

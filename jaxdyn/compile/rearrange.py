@@ -4,12 +4,11 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.program import NotNumbers, as_kind, as_objects, is_number, kind_or_refuse, objects
+from jaxdyn.compile.program import Array, NotNumbers, as_kind, as_objects, is_number, kind_or_refuse, objects
 
 
 def _slice(params, args, out):
@@ -30,18 +29,6 @@ def _reshape(params, args, out):
     return (args[0] if order is None else args[0].transpose(order)).reshape(out.shape)
 
 
-def _unstack(params, args, out):
-    return list(np.moveaxis(args[0], params["axis"], 0))
-
-
-def _split(params, args, out):
-    return np.split(args[0], np.cumsum(params["sizes"])[:-1], params["axis"])
-
-
-class _Shaped(NamedTuple):
-    shape: tuple[int, ...]
-
-
 def _pad(params, args, out):
     padded = np.full(out.shape, args[1].item(), args[0].dtype)
     # Gaps between entries occur in transposes of strided slices.
@@ -52,7 +39,7 @@ def _pad(params, args, out):
         shape = [
             low + high + max(n + (n - 1) * gap, 0) for (low, high, gap), n in zip(kept, args[0].shape, strict=True)
         ]
-        whole = _pad({"padding_config": kept}, args, _Shaped(tuple(shape)))
+        whole = _pad({"padding_config": kept}, args, Array(tuple(shape), args[0].dtype))
         return whole[
             tuple(slice(max(-low, 0), n - max(-high, 0)) for (low, high, _), n in zip(config, shape, strict=True))
         ]
@@ -74,14 +61,7 @@ def _flat_places(
     its size along all; `window_dims` are the dimensions of the result that belong to the window.
     """
     lead = indices.shape[:-1]
-    rank, others = len(result_shape), [i for i in range(len(result_shape)) if i not in window_dims]
-
-    def along(values, dims):  # an array with the given dimensions of the result
-        order = [1] * rank
-        for dim, size in zip(dims, values.shape, strict=True):
-            order[dim] = size
-        return values.reshape(order)
-
+    others = [i for i in range(len(result_shape)) if i not in window_dims]
     # Flat places of all entries at once, as sums of broadcast arrays: windows of a gather have any number of dimensions.
     flat = np.zeros(result_shape, np.int64)
     inside = np.ones(result_shape, bool)
@@ -93,11 +73,11 @@ def _flat_places(
         elif dim in batching:
             axis = index_batching[batching.index(dim)]
             start = np.broadcast_to(np.arange(size).reshape([-1 if i == axis else 1 for i in range(len(lead))]), lead)
-        inside &= along((start >= 0) & (start <= size - sizes[dim]), others)
+        inside &= _along((start >= 0) & (start <= size - sizes[dim]), others, result_shape)
         # XLA moves a window that is partly outside of the array to its edge.
-        at = along(np.clip(start, 0, size - sizes[dim]), others)
+        at = _along(np.clip(start, 0, size - sizes[dim]), others, result_shape)
         if dim in window:
-            at = at + along(np.arange(sizes[dim]), [window_dims[window.index(dim)]])
+            at = at + _along(np.arange(sizes[dim]), [window_dims[window.index(dim)]], result_shape)
         flat += at * int(stride)
     return flat, inside
 
@@ -157,10 +137,10 @@ REARRANGEMENTS: dict[str, Callable] = {
     "concatenate": lambda params, args, out: np.concatenate(args, params["dimension"]),
     "stack": lambda params, args, out: np.stack(args, params["axis"]),
     "tile": lambda params, args, out: np.tile(args[0], params["reps"]),
-    "unstack": _unstack,
+    "unstack": lambda params, args, out: list(np.moveaxis(args[0], params["axis"], 0)),
     "slice": _slice,
     "broadcast_in_dim": _broadcast,
-    "split": _split,
+    "split": lambda params, args, out: np.split(args[0], np.cumsum(params["sizes"])[:-1], params["axis"]),
     "pad": _pad,
 }
 
@@ -243,7 +223,7 @@ def scatter_at(expansion, params, args, eqn):
     operand, indices, updates = args
     g, d = expansion.graph, params["dimension_numbers"]
     adds, kind = eqn.primitive.name != "scatter", kind_or_refuse(eqn.outvars[0].aval.dtype)
-    window = [i for i in range(operand.ndim) if i not in (*d.inserted_window_dims, *d.operand_batching_dims)]
+    window = _window_dims(operand.shape, d.inserted_window_dims, d.operand_batching_dims)
     sizes = {i: updates.shape[of_update] for i, of_update in zip(window, d.update_window_dims, strict=True)}
     ends = [operand.shape[i] - sizes.get(i, 1) for i in d.scatter_dims_to_operand_dims]
     others = [i for i in range(updates.ndim) if i not in d.update_window_dims]
@@ -396,12 +376,12 @@ def _clip_all(g: Graph, indices, ends: Sequence[int]) -> np.ndarray:
     return objects([_clip(g, x, end) for row in rows for x, end in zip(row, ends, strict=True)], indices.shape)
 
 
-def _along(flags: np.ndarray, dims: Sequence[int], shape: Sequence[int]) -> np.ndarray:
-    """Flags with the given dimensions of a shape, to be broadcast to it."""
+def _along(values: np.ndarray, dims: Sequence[int], shape: Sequence[int]) -> np.ndarray:
+    """An array with the given dimensions of a shape, to be broadcast to it."""
     order = [1] * len(shape)
-    for dim, size in zip(dims, flags.shape, strict=True):
+    for dim, size in zip(dims, values.shape, strict=True):
         order[dim] = size
-    return flags.reshape(order)
+    return values.reshape(order)
 
 
 def _select(expansion, flags, here, otherwise, eqn) -> np.ndarray:

@@ -178,10 +178,11 @@ def roll(
         own_carries = make(classes.types)
         own_rows = make([Array((len(x.passed),), x.dtype) for x in rows if x.passed])
         own_tables = make([Array((len(x.known),), x.dtype) for x in rows if x.known])
+        of_passed, of_known = iter(own_rows), iter(own_tables)
         given = (
             [x.entries(iter(y), None) for x, y in _pairs(consts, own_consts)],
             classes.entries(own_carries),
-            _row_entries(rows, own_rows, own_tables),
+            [x.entries(of_passed, of_known) for x in rows],
         )
         results = [as_objects(x) for x in body(inner, *given)]
         ends, outs = results[: len(carries)], results[len(carries) :]
@@ -315,11 +316,6 @@ def _pairs(groups: Sequence[_Group], inputs: list):
     """Groups with the array that each takes, if it takes one."""
     at = iter(inputs)
     return [(x, [next(at)] if x.passed else []) for x in groups]
-
-
-def _row_entries(groups: Sequence[_Group], passed: list, known: list) -> list[np.ndarray]:
-    of_passed, of_known = iter(passed), iter(known)
-    return [x.entries(of_passed, of_known) for x in groups]
 
 
 # --- carries ---

@@ -257,11 +257,6 @@ def is_float(x) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
-def mark_floats(flag: jax.Array, tree):
-    """`mark_invalid` the float arrays of a pytree; others stay as they are."""
-    return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, tree)
-
-
 _marked: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # jaxprs that were looked through
 
 

@@ -8,24 +8,39 @@ of some arrays, and constants; it returns a carry, rows, and terms of sums. Iter
 
 `lax.scan` is the chain, outward, or inward if it runs in reverse. The transpose of a linear outward scan is an inward one, and
 that of an inward one is outward; constants and sums change places too. So derivatives of all orders are scans. The code is in
-`scan_text`.
+`code`.
 """
 
 import functools
 import hashlib
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxdyn.compile import derive
+from jaxdyn.compile.body import symbol_of
+from jaxdyn.compile.code import ATTRIBUTES, ScanText
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import arrays_of, replay
 from jaxdyn.compile.program import Array, Constant, Program, as_objects, is_number
 
 # Operations beyond which a loop is not written out. LLVM takes some 50 microseconds for each: one second.
 MAX_WRITTEN_OUT = 20_000
+
+
+def _once(derive_scan: Callable) -> Callable:
+    """Keep what a method derives from a scan and hashable arguments; a decorator."""
+
+    @functools.wraps(derive_scan)
+    def call(scan, *args):
+        key = (derive_scan.__name__, *args)
+        if key not in scan.derived:
+            scan.derived[key] = derive_scan(scan, *args)
+        return scan.derived[key]
+
+    return call
 
 
 class Counts(NamedTuple):
@@ -83,9 +98,10 @@ class Scan:
 
     def call(self, graph: Graph, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
         """The outputs of a call with these inputs, of which those are passed that the body reads."""
-        few, places = self._derive_once("read", self._with_read_inputs)
+        few, places = self._with_read_inputs()
         return graph.call(few, [arrays[i] for i in places])
 
+    @_once
     def _with_read_inputs(self) -> tuple["Scan", list[int]]:
         if self.condition is not None:
             return self, list(range(len(self.inputs)))
@@ -106,11 +122,9 @@ class Scan:
             i for group in kept[:3] for i in group
         ]
 
-    def with_outputs(self, needed: Sequence[bool]) -> "Scan":
+    @_once
+    def with_outputs(self, needed: tuple[bool, ...]) -> "Scan":
         """The scan of its carries and of those of its other outputs that are needed."""
-        return self._derive_once(("outputs", tuple(needed)), lambda: self._with_outputs(needed))
-
-    def _with_outputs(self, needed: Sequence[bool]) -> "Scan":
         kept = [i for i, flag in enumerate(needed) if flag or i < self.counts.carries]
         _, sums, results = self.split_outputs(needed)
         body = rewrite(self.body, range(len(self.body.inputs)), kept)
@@ -134,14 +148,7 @@ class Scan:
     # --- on disk ---
 
     def __getstate__(self):
-        return vars(self) | {
-            "derived": {},
-            "body": parts_of_program(self.body),
-            "condition": parts_of_program(self.condition),
-        }
-
-    def __setstate__(self, state):
-        self.__dict__ |= state | {name: program_of_parts(state[name]) for name in ("body", "condition")}
+        return vars(self) | {"derived": {}}
 
     def describe(self) -> "Scan":
         """Itself, as what is kept of it on disk (see `stored`)."""
@@ -155,15 +162,17 @@ class Scan:
 
     def subprogram_ir(self, width: int) -> str:
         """The text of the function `called` (see `code.subprogram_ir`)."""
-        from jaxdyn.compile.code import scan_ir
-
-        return scan_ir(self, width)
+        text = ScanText(self, width, "called")
+        return "\n".join([text.function(), *text.e.declared.values(), *ATTRIBUTES])
 
     def definition(self, symbol: str) -> dict[str, str]:
-        """The text of the function for one sample, and what it calls, by names in a module's text."""
-        from jaxdyn.compile.code import scan_definition
-
-        return scan_definition(self, symbol)
+        """The function for one sample, and the loops that it calls, by names in a module's text. Programs are declared."""
+        text = ScanText(self, 1, symbol)
+        parts = {symbol: text.function().replace("define void", "define internal void", 1)}
+        for called in self.subprograms:
+            if (name := symbol_of(called, 1)) in text.e.declared and hasattr(called, "definition"):
+                text.e.declared |= called.definition(name)
+        return text.e.declared | parts
 
     # --- derivatives ---
 
@@ -171,16 +180,11 @@ class Scan:
         inward = self.inward if inward is None else inward
         return Scan(body, counts, self.length, self.tables, inward, self.parents, self.condition)
 
-    def _derive_once(self, key, make) -> Any:
-        if key not in self.derived:
-            self.derived[key] = make()
-        return self.derived[key]
-
     def call_with_changes(self, graph: Graph, values: list, changes: list) -> tuple[list, list]:
         """Entries of the outputs and their changes, for entries of the inputs and their changes (0.0: none)."""
         arrays, steps = arrays_of(self.inputs, values), arrays_of(self.inputs, changes)
         moving = tuple(any(is_number(x) or x != 0 for x in step.flat) for step in steps)
-        tangent, moves = self._derive_once(("tangent", moving), lambda: self._tangent(moving))
+        tangent, moves = self._tangent(moving)
         groups = zip(*(split_by_counts(x, self.counts[:3]) for x in (arrays, steps, moves[: len(arrays)])), strict=True)
         made = iter(tangent.call(graph, [x for group in groups for x in with_changes(*group)]))
         outs, out_steps = [], []
@@ -194,6 +198,7 @@ class Scan:
             ]
         return entries_of(outs), entries_of(out_steps)
 
+    @_once
     def _tangent(self, moving: tuple[bool, ...]) -> tuple["Scan", tuple[bool, ...]]:
         """The scan of values and changes, and which of the inputs and then of the outputs change."""
         body, tables = self.body, self.split_inputs(self.body.inputs)[3]
@@ -243,11 +248,9 @@ class Scan:
             )
         return TransposedCall(graph, self, values)
 
+    @_once
     def split_linear(self, linear: tuple[bool, ...]) -> "Linear":
         """The scan of what does not depend on the inputs that are `linear`, and the linear scan of the rest."""
-        return self._derive_once(("split", linear), lambda: self._split_linear(linear))
-
-    def _split_linear(self, linear: tuple[bool, ...]) -> "Linear":
         body, tables = self.body, self.counts.tables
         l_consts, l_carries, l_rows = split_by_counts(linear, self.counts[:3])
 
@@ -284,11 +287,9 @@ class Scan:
         outputs = self.split_linear(tuple(bool(x.any()) for x in arrays_of(self.inputs, flags))).outputs
         return [flag for flag, array in zip(outputs, self.outputs, strict=True) for _ in range(array.size)]
 
+    @_once
     def transpose(self, linear: tuple[bool, ...]) -> "Scan":
         """The transpose of a scan whose body is linear in these inputs, all carries among them."""
-        return self._derive_once(("transpose", linear), lambda: self._transpose(linear))
-
-    def _transpose(self, linear: tuple[bool, ...]) -> "Scan":
         backwards = derive.transpose(self.body, linear, [True] * len(self.body.outputs))
         l_consts, _, l_rows, _ = self.split_inputs(linear)
         c, s, y, t = self.counts.carries, self.counts.sums, self.counts.results, self.counts.tables
@@ -407,21 +408,6 @@ def tangent_of(body: Program, moving: tuple[bool, ...]) -> tuple[Program, list[b
     rows = iter(change.results)
     found = [next(rows) if x.dtype.kind == "f" else () for x in body.outputs]
     return change, [any(type(x) is not Constant or x.value != 0 for x in row) for row in found]
-
-
-def parts_of_program(program: Program | None) -> tuple | None:
-    """Data of a program that a file keeps."""
-    if program is None:
-        return None
-    return program.inputs, program.outputs, program.operations, program.results, program.subprograms
-
-
-def program_of_parts(parts: tuple | None) -> Program | None:
-    """The inverse of `parts_of_program`."""
-    if parts is None:
-        return None
-    inputs, outputs, operations, results, inner = parts
-    return Program(inputs, outputs, operations, results, inner)
 
 
 def with_more_inputs(program: Program, types: Sequence[Array], moves: Sequence[Sequence[bool]]) -> Program:

@@ -13,6 +13,7 @@ import os
 import pickle
 import sys
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,10 @@ _VARIABLES = ("XLA_FLAGS", "JAXDYN_COMPILATION", "JAXDYN_COMPILATION_OPTIONS")
 @functools.cache
 def environment() -> bytes:
     """Hash of the package's sources, and of the versions of what it calls."""
-    versions = [disk.version_of(name) for name in _PACKAGES]
+    versions = []
+    for name in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions.append(f"{name} {metadata.version(name)}")
     with contextlib.suppress(ImportError):  # no llvmlite
         from jaxdyn.compile import objects
 
@@ -138,25 +142,22 @@ def load_or_make(key: str | None, make: Callable[[], tuple[Sequence[Program], An
     Derivatives and fallbacks of the programs are not kept: they are functions, which the caller sets.
     """
     with phase("expansion"):
-        return make() if key is None else _load_or_make(key, make)
-
-
-def _load_or_make(key: str, make: Callable) -> tuple[Sequence[Program], Any]:
-    found = load(f"{key}.program")
-    if found is not None:
-        again = functools.partial(in_modes, mode.remember(), make)
-        programs = [x.restore(functools.partial(_program_of, again, i)) for i, x in enumerate(found[0])]
-        data = found[1]
-    else:
-        programs, data = make()
-        if not all(x.is_kept for x in programs):
-            return programs, data
-        for one in programs:
-            _save_operations(one)
-        save(f"{key}.program", ([*map(Description.of, programs)], data))
-    for i, one in enumerate(programs):
-        one.key = f"{key}-{i}"
-    return programs, data
+        if key is None:
+            return make()
+        found = load(f"{key}.program")
+        if found is not None:
+            again, (descriptions, data) = functools.partial(in_modes, mode.remember(), make), found
+            programs = [x.restore(lambda i=i: again()[0][i]) for i, x in enumerate(descriptions)]
+        else:
+            programs, data = make()
+            if not all(x.is_kept for x in programs):
+                return programs, data
+            for one in programs:
+                _save_operations(one)
+            save(f"{key}.program", ([*map(Description.of, programs)], data))
+        for i, one in enumerate(programs):
+            one.key = f"{key}-{i}"
+        return programs, data
 
 
 def _save_operations(program: Any) -> None:
@@ -173,10 +174,6 @@ def in_modes(enter: Callable, make: Callable) -> Any:
         return make()
 
 
-def _program_of(make: Callable, i: int) -> Program:
-    return make()[0][i]
-
-
 def make_within(program: Program, parts: tuple, make: Callable[[], Program]) -> Program:
     """A program that is made of another one's operations, from disk where it is there."""
     return load_or_make(key_within(program, *parts), lambda: ([make()], None))[0][0]
@@ -188,7 +185,7 @@ def key_within(program: Program, *parts: Any) -> str | None:
 
 
 def load(name: str) -> Any:
-    """What `save` has kept under a name, or None."""
+    """Read the object that `save` wrote under this name; None if there is none."""
     contents = disk.read(name)
     if contents is None:
         return None

@@ -9,9 +9,10 @@ from functools import partial
 from importlib import resources
 from typing import Any, NamedTuple
 
+import llvmlite.binding as llvm
 import numpy as np
 
-from jaxdyn.compile import first_calls, objects
+from jaxdyn.compile import disk, first_calls, objects
 from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.careful import CAREFUL, Careful, identity_of, number_of, run_apart
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, varying_first
@@ -78,14 +79,14 @@ def register() -> None:
 def _register() -> None:
     code = objects.code_of(fill_handler("jaxdyn_table", _table))
     register_handler(TARGET, code.address("handler"))
-    code.publish("careful", CAREFUL)
+    objects.add_symbol(CAREFUL, code.address("careful"))
     _codes.append(code)
 
 
 def fill_handler(name: str, table: ctypes.Array) -> str:
     """The text of the handler for a table of this process, which the text knows by a name. **Raises:** `Unsupported`."""
     version = ffi_version()
-    architecture = _architecture()
+    architecture = llvm.get_process_triple().split("-")[0].replace("arm64", "aarch64")
     if architecture not in _RELAX:
         raise Unsupported(f"the processor is {architecture}, and kernels are written for {', '.join(_RELAX)}")
     text = resources.files("jaxdyn.compile").joinpath("handler.ll").read_text()
@@ -100,7 +101,7 @@ def fill_handler(name: str, table: ctypes.Array) -> str:
     # Places of this process have names in the text, so that its code is found on disk.
     for symbol, place in ((name, table), ("jaxdyn_limit", _threads), ("jaxdyn_failures", _failures)):
         objects.add_symbol(symbol, ctypes.addressof(place))
-    objects.add_symbol("jaxdyn_prepare", ctypes.cast(_PREPARE, ctypes.c_void_p).value or 0)
+    objects.add_symbol("jaxdyn_prepare", ctypes.cast(_prepare, ctypes.c_void_p).value or 0)
     return text
 
 
@@ -112,12 +113,6 @@ def is_available() -> bool:
     except Unsupported:
         return False
     return True
-
-
-def _architecture() -> str:
-    import llvmlite.binding as llvm
-
-    return llvm.get_process_triple().split("-")[0].replace("arm64", "aarch64")
 
 
 @functools.cache
@@ -148,7 +143,11 @@ def kernel(program, width: int, uniform: Sequence[bool]) -> int:
             number = number_of(program, width, uniform)
             if number not in _kernels:
                 _kernels[number] = _Kernel(number, Row.of(program, width, uniform))
-            _kernels[number].attach(program, uniform)
+            found = _kernels[number]
+            if isinstance(program, Careful):
+                found.careful = program
+            elif not found.is_made and found.program is None:
+                found.program, found.uniform = program, uniform
             _enter_careful(program)
             program.derived[key] = number
         return program.derived[key]
@@ -228,13 +227,6 @@ class _Kernel:
         self.entry.buffers, self.entry.sizes = len(row.sizes), ctypes.addressof(self.sizes)
         self.entry.hash = number  # last: from here on it is found
 
-    def attach(self, program, uniform: tuple[bool, ...]) -> None:
-        """Take the program of which the code can be made."""
-        if isinstance(program, Careful):
-            self.careful = program
-        elif not self.is_made and self.program is None:
-            self.program, self.uniform = program, uniform
-
     def address(self) -> int:
         """Address of the code, which is compiled where there is none."""
         if not self.is_made and not self.make():
@@ -251,15 +243,16 @@ class _Kernel:
         if row.careful is None:
             return self._make_of(self.program, row.identity)
         # A careful program is traced only where its code is not on disk.
-        identity = objects.find_careful(row.careful) if row.is_kept else None
-        if identity is not None and self._make_of(None, identity):
+        file = objects.name_of_file(f"careful {row.careful}")
+        known = disk.read(file) if row.is_kept else None
+        if known is not None and self._make_of(None, known.decode()):
             return True
         if self.careful is None:
             return False
         program = self.careful.program()
         identity = identity_of(program, row.width, [False] * len(program.inputs))
         if row.is_kept and program.is_kept:
-            objects.keep_careful(row.careful, identity)
+            disk.write(file, identity.encode())
         _enter_careful(program)
         return self._make_of(program, identity)
 
@@ -288,12 +281,9 @@ class _Kernel:
             quick = None if is_call else _write_quick(program, quick_width, write)
             found = objects.make(identity, write, tuple(calls), careful, program.name, quick_width, quick)
             is_new = True
-        _install(found, identity, "kernel", self._enter, is_new)
+        _install(found, identity, "kernel", partial(setattr, self.entry, "kernel"), is_new)
         self.is_made, self.program = True, None  # a program of a large robot takes megabytes
         return True
-
-    def _enter(self, address: int) -> None:
-        self.entry.kernel = address
 
     def _recover_careful(self) -> None:
         """Make the careful programs that this kernel's code calls."""
@@ -440,6 +430,7 @@ def _restore_careful(rows: Sequence, recover: Callable | None) -> None:
             _restore(number, Row(*row), recover)
 
 
+@ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint64)
 def _prepare(number: int) -> int:
     """Compile a kernel that is called for the first time; its address, or zero where that fails. The handler calls this."""
     try:
@@ -449,9 +440,6 @@ def _prepare(number: int) -> int:
         with _lock:
             _failures.value += 1
         return 0
-
-
-_PREPARE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint64)(_prepare)
 
 
 class Call:

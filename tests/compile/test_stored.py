@@ -85,7 +85,7 @@ def test_keys_cover_the_package_the_versions_and_the_options(monkeypatch, tmp_pa
         assert key() != before
     environment = stored.environment.__wrapped__
     assert environment() == stored.environment()
-    monkeypatch.setattr(disk, "version_of", lambda name: "0" if name == "jax" else "")
+    monkeypatch.setattr(stored.metadata, "version", lambda name: "0")
     assert environment() != stored.environment()
     (tmp_path / "module.py").write_text("A = 1")
     first = disk.hash_of_sources.__wrapped__(tmp_path)
