@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from jaxdyn.compile import derive, mode
 from jaxdyn.compile.llvm import Emitter
-from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
+from jaxdyn.compile.program import Array, Constant, Operation, Program, derived, kind_of
 from jaxdyn.compile.rules import change_along
 from jaxdyn.compile.stored import error_of_retrace, key_within
 
@@ -78,42 +78,34 @@ class Careful:
         """Its description among the subprograms that are kept on disk (see `stored`)."""
         return Description(self.inputs, self.outputs, self.digest, self.name, self.which)
 
-    def tangent(self, moving: Sequence[bool]) -> "Careful":
+    @derived
+    def tangent(self, moving: tuple[bool, ...]) -> "Careful":
         """The program of the change of the outputs (see `derive.tangent`)."""
-        moving = tuple(moving)
-        if moving not in self.derived:
-            inputs = [*self.inputs, *(x for x, varies in zip(self.inputs, moving, strict=True) if varies)]
-            outputs = [array for array in self.outputs if array.dtype.kind == "f"]
-            self.derived[moving] = Careful(
-                inputs,
-                outputs,
-                _digest(self.digest, "tangent", moving),
-                f"change of {self.name}",
-                lambda: derive.tangent(self._program(), moving),
-                functools.partial(_tangent_by_jax, self, moving),
-                self.which,
-                self.is_kept,
-            )
-        return self.derived[moving]
+        return Careful(
+            [*self.inputs, *(x for x, varies in zip(self.inputs, moving, strict=True) if varies)],
+            [array for array in self.outputs if array.dtype.kind == "f"],
+            _digest(self.digest, "tangent", moving),
+            f"change of {self.name}",
+            lambda: derive.tangent(self._program(), moving),
+            functools.partial(_tangent_by_jax, self, moving),
+            self.which,
+            self.is_kept,
+        )
 
-    def transpose(self, linear: Sequence[bool], given: Sequence[bool], of_program: Callable) -> "Careful":
+    @derived
+    def transpose(self, linear: tuple[bool, ...], given: tuple[bool, ...], of_program: Callable) -> "Careful":
         """The program of cotangents of the `linear` inputs (see `derive.transpose`), by `of_program(program, linear, given)`."""
-        linear, given = tuple(linear), tuple(given)
-        key = ("transposed", linear, given)
-        if key not in self.derived:
-            inputs = [x for x, varies in zip(self.inputs, linear, strict=True) if not varies]
-            inputs += [x for x, is_given in zip(self.outputs, given, strict=True) if is_given]
-            self.derived[key] = Careful(
-                inputs,
-                [x for x, varies in zip(self.inputs, linear, strict=True) if varies],
-                _digest(self.digest, *key),
-                f"transpose of {self.name}",
-                lambda: of_program(self._program(), linear, given),
-                functools.partial(_transpose_by_jax, self, linear, given),
-                self.which,
-                self.is_kept,
-            )
-        return self.derived[key]
+        fixed = [x for x, varies in zip(self.inputs, linear, strict=True) if not varies]
+        return Careful(
+            [*fixed, *(x for x, is_given in zip(self.outputs, given, strict=True) if is_given)],
+            [x for x, varies in zip(self.inputs, linear, strict=True) if varies],
+            _digest(self.digest, "transposed", linear, given),
+            f"transpose of {self.name}",
+            lambda: of_program(self._program(), linear, given),
+            functools.partial(_transpose_by_jax, self, linear, given),
+            self.which,
+            self.is_kept,
+        )
 
 
 class Description(NamedTuple):

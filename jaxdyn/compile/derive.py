@@ -6,7 +6,7 @@ its partial derivatives need are operations of the same program, so that they ar
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,25 +14,20 @@ import numpy as np
 from jaxdyn.compile import stored
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import inline, repeat, replay
-from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program, is_number, objects
+from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program, derived, is_number, objects
 
 
-def tangent(program: Program, moving: Sequence[bool]) -> Program:
+@derived
+def tangent(program: Program, moving: tuple[bool, ...]) -> Program:
     """Tangent of a program, as a program: the change of the floating-point outputs.
 
     Its inputs are all inputs of `program`, followed by the changes of the inputs that are `moving`.
     """
-    moving = tuple(moving)
-    if moving not in program.derived:
-        rule = program.derivative
-        # Known numbers are folded by NumPy, which warns of overflows and NaN that XLA computes without a word.
-        with np.errstate(all="ignore"):
-            make = functools.partial(_tangent, program, moving)
-            # A rule keeps its program itself, as that may have a rule again.
-            program.derived[moving] = (
-                stored.make_within(program, ("tangent", moving), make) if rule is None else rule(moving)
-            )
-    return program.derived[moving]
+    # Known numbers are folded by NumPy, which warns of overflows and NaN that XLA computes without a word.
+    with np.errstate(all="ignore"):
+        if program.derivative is not None:  # a rule, which keeps its program itself, as that may have a rule again
+            return program.derivative(moving)
+        return stored.make_within(program, ("tangent", moving), functools.partial(_tangent, program, moving))
 
 
 def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
@@ -189,18 +184,16 @@ _PARTIAL: dict[str, Callable[..., Any]] = {
 }
 
 
-def transpose(program: Program, linear: Sequence[bool], given: Sequence[bool]) -> Program:
+@derived
+def transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
     """Transpose of a program that is jointly linear in its `linear` inputs.
 
     Its inputs are the other inputs, followed by the cotangents of the outputs that are `given` (those of the other outputs are
     zero). Its outputs are the cotangents of the `linear` inputs.
     """
-    key = ("transposed", tuple(linear), tuple(given))
-    if key not in program.derived:
-        with np.errstate(all="ignore"):
-            make = functools.partial(_transpose, program, tuple(linear), tuple(given))
-            program.derived[key] = stored.make_within(program, key, make)
-    return program.derived[key]
+    with np.errstate(all="ignore"):
+        make = functools.partial(_transpose, program, linear, given)
+        return stored.make_within(program, ("transposed", linear, given), make)
 
 
 def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
@@ -317,16 +310,14 @@ def _transpose_operation(g: Graph, op: str, kind: str, args, values, c, accumula
 # --- inputs that are read ---
 
 
+@derived
 def without_unread(program: Program) -> tuple[Program, tuple[int, ...]]:
     """The program with those of its inputs alone that it reads, and their places.
 
     A model that is an argument has leaves that a function does not need, such as the limits of its joints, and JAX takes a third
     of a microsecond for each leaf of a call.
     """
-    key = ("read",)
-    if key not in program.derived:
-        program.derived[key] = _with_inputs(program, program.read_places), program.read_places
-    return program.derived[key]
+    return _with_inputs(program, program.read_places), program.read_places
 
 
 def _with_inputs(program: Program, places: tuple[int, ...]) -> Program:
@@ -360,7 +351,7 @@ def _renumber_inputs(program: Program, index: dict[int, int]) -> Program:
 def _tangent_of_few(program: Program, places: tuple[int, ...], moving) -> Program:
     varying = {place for place, varies in zip(places, moving, strict=True) if varies}
     count = len(program.inputs)
-    change = tangent(program, [i in varying for i in range(count)])
+    change = tangent(program, tuple([i in varying for i in range(count)]))
     return _with_inputs(change, (*places, *range(count, len(change.inputs))))
 
 

@@ -238,9 +238,9 @@ def quick_options() -> dict[str, Any] | None:
 
     None where the environment asks for the usual ones.
     """
-    if mode.wants_usual_options():
+    if mode.options() == "usual":
         return None
-    return select_options(_LEAST if mode.wants_least_optimisation() else _QUICK)
+    return select_options(_LEAST if mode.options() == "least" else _QUICK)
 
 
 def glue_options(platform: str) -> dict[str, Any] | None:

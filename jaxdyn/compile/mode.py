@@ -162,17 +162,9 @@ def remember() -> Callable[[], contextlib.AbstractContextManager]:
     return enter
 
 
-def wants_usual_options() -> bool:
-    """Decide whether the environment asks for XLA's usual options instead of those that shorten a first call."""
-    return _options() == "usual"
-
-
-def wants_least_optimisation() -> bool:
-    """Decide whether the environment asks for code that compiles fast and runs slowly, as most tests do."""
-    return _options() == "least"
-
-
-def _options() -> str:
+def options() -> str:
+    """The environment's wish: XLA's "usual" options instead of those that shorten a first call, or code that compiles fast
+    and runs slowly ("least"), as in most tests."""
     options = os.environ.get("JAXDYN_COMPILATION_OPTIONS", "")
     if options not in OPTIONS:
         shown = ", ".join(map(repr, OPTIONS[1:]))

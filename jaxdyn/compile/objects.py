@@ -21,7 +21,7 @@ import llvmlite
 import llvmlite.binding as llvm
 
 from jaxdyn.compile import disk
-from jaxdyn.compile.mode import wants_least_optimisation, wants_usual_options
+from jaxdyn.compile.mode import options as wanted_options
 
 logger = logging.getLogger("jaxdyn")
 ANNOUNCED_LINES = 100_000  # of LLVM's text, which compile in some five seconds
@@ -56,7 +56,7 @@ def target_machine(level: int | None = None):
 def _level() -> int:
     """Level at which LLVM turns its instructions into those of the processor."""
     # Level 2 adds a second scheduler, which takes half of the time in functions of tens of thousands of lines.
-    return 0 if wants_least_optimisation() else 1
+    return 0 if wanted_options() == "least" else 1
 
 
 def name_of_file(identity: str) -> str:
@@ -138,7 +138,7 @@ def make(
 
 def has_two_levels() -> bool:
     """Decide whether code is made quickly at first."""
-    return not wants_least_optimisation() and not wants_usual_options()
+    return not wanted_options()
 
 
 def _keep(identity: str, made: ObjectFile) -> None:
@@ -210,7 +210,7 @@ def _in_short_blocks(text: str) -> str:
 
 def compile_text(text: str, is_quick: bool = False) -> bytes:
     """The object file of a text of LLVM."""
-    if is_quick or wants_least_optimisation():
+    if is_quick or wanted_options() == "least":
         # LLVM 22 at level 0 aborts where it merges loads with their broadcasts ("Node is not in map!").
         text = _in_short_blocks(_BROADCAST.sub(r"  \3.frozen = freeze \2 \3\n\1\3.frozen\4", text))
         machine = target_machine(0)

@@ -19,7 +19,7 @@ from jaxdyn.compile.careful import guard
 from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.operations import as_operations, by_jax
-from jaxdyn.compile.program import Array, Constant, NotNumbers, Operation, Program, TooLong, dtype_of
+from jaxdyn.compile.program import Array, Constant, NotNumbers, Operation, Program, TooLong, derived, dtype_of
 from jaxdyn.compile.rules import change_along, mark_invalid
 from jaxdyn.compile.stored import key_within, load_or_make
 from jaxdyn.compile.trace import tangent_program
@@ -96,14 +96,12 @@ def _jvp(primals, tangents, *, program, rows):
     return results, out
 
 
+@derived
 def _transpose_program(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
     """The transpose of a program (see `derive`), which honours the rules of the program when it is differentiated."""
     if program.fast is not None:
-        key = ("transposed", linear, given)
-        if key not in program.derived:
-            fast, careful = _transpose_program(program.fast, linear, (*given, False)), program.careful
-            program.derived[key] = guard(fast, lambda: careful.transpose(linear, given, _transpose_program))
-        return program.derived[key]
+        fast, careful = _transpose_program(program.fast, linear, (*given, False)), program.careful
+        return guard(fast, lambda: careful.transpose(linear, given, _transpose_program))
     backwards = derive.transpose(program, linear, given)
     # Differentiating the numbers of the transpose would ignore a rule inside the program: the second derivative of a root
     # by bisection was zero.
@@ -128,7 +126,7 @@ def _tangent_of_transpose(program, linear, given, backwards, avals, moving) -> P
         total = None
         if any(moving[:count]):
             each = iter(moving[:count])
-            first = derive.tangent(program, [False if is_linear else next(each) for is_linear in linear])
+            first = derive.tangent(program, tuple([not is_linear and next(each) for is_linear in linear]))
             floats = [x.dtype.kind == "f" for x in program.outputs]
             given_floats = [is_given for is_given, is_float in zip(given, floats, strict=True) if is_float]
             given_floats += [False] * first.reports_validity
@@ -257,7 +255,7 @@ def _lower_elsewhere(*args, program, rows):
 def _lower_to_call(ctx, *operands, program, rows, on_gpu=False):
     # Each rewriting below lowers a function that binds the primitive again, nearer to a call that the handler knows.
     lead = ctx.avals_out[0].shape[:-1] if ctx.avals_out else ()
-    uniform = [bool(lead) and len(x.shape) == 1 for x in ctx.avals_in]
+    uniform = tuple([bool(lead) and len(x.shape) == 1 for x in ctx.avals_in])
     if any(uniform) and not all(uniform) and len(lead) == rows:
         # Rows go through the kernel of one sample, which is compiled already and has no notion of shared operands.
         return lowering_of(_broadcast_rows)(ctx, *operands, program=program, rows=rows)
@@ -324,8 +322,7 @@ def _broadcast_rows(*args, program, rows):
 
 def _call_in_two(*args, program, rows):
     """The call as two, the first of the numbers that all samples share."""
-    uniform = [x.ndim == 1 for x in args]
-    parts = split_program(program, uniform)
+    parts = split_program(program, tuple([x.ndim == 1 for x in args]))
     assert parts is not None
     once, each = parts
     shared = kernel_p.bind(*(x for x in args if x.ndim == 1), program=once, rows=0)
@@ -352,7 +349,8 @@ kernel_p = define_primitive(
 # that it needs. For forward dynamics of a given robot the first program has a third of the operations.
 
 
-def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
+@derived
+def split_program(program, uniform: tuple[bool, ...]) -> tuple[Program, Program] | None:
     """Split a program into one of the uniform inputs and one of all inputs and the results of the first.
 
     `uniform` marks the inputs that are equal for all samples. None where so few operations are shared that a second call
@@ -360,13 +358,9 @@ def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] |
     """
     if not isinstance(program, Program) or not any(uniform):
         return None
-    key = ("split", tuple(uniform))
-    if key not in program.derived:
-        # A program or two, or none.
-        make = functools.partial(_split, program, uniform)
-        both, _ = load_or_make(key_within(program, *key), lambda: (make() or (), None))
-        program.derived[key] = tuple(both) or None
-    return program.derived[key]
+    # Two programs, or none.
+    both, _ = load_or_make(key_within(program, "split", uniform), lambda: (_split(program, uniform) or (), None))
+    return (both[0], both[1]) if both else None
 
 
 def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:

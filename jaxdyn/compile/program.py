@@ -134,6 +134,19 @@ class Program:
         return counts_by_kind
 
 
+def derived(make: Callable) -> Callable:
+    """Keep what a function derives from a program and hashable arguments, for as long as the program lives; a decorator."""
+
+    @functools.wraps(make)
+    def call(program, *args):
+        key = (make.__name__, *args)
+        if key not in program.derived:
+            program.derived[key] = make(program, *args)
+        return program.derived[key]
+
+    return call
+
+
 def _weight(operation: Operation) -> int:
     """Number of instructions of an operation: those of several operands are written as a chain."""
     op, _, args = operation

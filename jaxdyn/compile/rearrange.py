@@ -191,9 +191,9 @@ def at_place(rule, expansion, params, args, eqn):
     ends = [n - m for n, m in zip(args[0].shape, sizes, strict=True)]
     chosen = [_clip(g, x, end) for x, end in zip(starts, ends, strict=True)]
     results = None
-    for place in _places(chosen, [range(end + 1) for end in ends], eqn):
+    for place, flag in _rounds(g, objects(chosen, (len(chosen),)), [range(end + 1) for end in ends], eqn):
         (here,) = rule(params, [*arrays, *map(np.asarray, place)], eqn)
-        results = here if results is None else _select(expansion, _is_at(g, chosen, place), here, results, eqn)
+        results = here if results is None else _select(expansion, flag, here, results, eqn)
     return [results]
 
 
@@ -337,14 +337,6 @@ def select_among(expansion, which, cases, out):
 # --- chains of places ---
 
 
-def _places(starts: Sequence, ranges: Sequence[range], eqn) -> Iterator[tuple[int, ...]]:
-    """All places that starts can have, of which some are known."""
-    choices = [values if is_number(x) else (int(x),) for x, values in zip(starts, ranges, strict=True)]
-    if (count := math.prod(map(len, choices))) > MOST_PLACES:
-        raise NotNumbers(f"{eqn.primitive.name} at one of {count} places that is not known")
-    return itertools.product(*choices)
-
-
 def _rounds(g: Graph, starts: np.ndarray, ranges: Sequence[range], eqn) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Known indices, the same for all rows of `starts`, and flags of the rows that have them."""
     rows = as_objects(starts).reshape(-1, starts.shape[-1])
@@ -355,16 +347,14 @@ def _rounds(g: Graph, starts: np.ndarray, ranges: Sequence[range], eqn) -> Itera
     if (count := math.prod(map(len, choices))) > MOST_PLACES:
         raise NotNumbers(f"{eqn.primitive.name} at one of {count} places that is not known")
     for place in itertools.product(*choices):
-        flags = objects([_is_at(g, row, place) for row in rows.tolist()], starts.shape[:-1])
-        yield np.broadcast_to(np.asarray(place, np.int64), starts.shape), flags
-
-
-def _is_at(g: Graph, starts: Sequence, place: Sequence[int]):
-    flags = [
-        g.compare("eq", x, as_kind(i, x.kind)) if is_number(x) else int(x) == i
-        for x, i in zip(starts, place, strict=True)
-    ]
-    return functools.reduce(g.both, flags, True)
+        flags = []
+        for row in rows.tolist():
+            same = (
+                g.compare("eq", x, as_kind(i, x.kind)) if is_number(x) else int(x) == i
+                for x, i in zip(row, place, strict=True)
+            )
+            flags.append(functools.reduce(g.both, same, True))
+        yield np.broadcast_to(np.asarray(place, np.int64), starts.shape), objects(flags, starts.shape[:-1])
 
 
 def _clip(g: Graph, x, end: int):

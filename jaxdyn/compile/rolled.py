@@ -6,13 +6,13 @@ symmetric matrix, are one entry.
 """
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.jax_adapter import scan_counts
+from jaxdyn.compile.jax_adapter import ClosedJaxpr, scan_counts  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,
     FlaggedIteration,
@@ -23,7 +23,7 @@ from jaxdyn.compile.program import (
     kind_or_refuse,
     objects,
 )
-from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan
+from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan, split_by_counts
 
 # Operations of an iteration beyond which there is no loop, but of a sweep.
 MAX_LOOP_BODY = 20_000
@@ -59,21 +59,69 @@ def scan(expansion, params, args, eqn):
     return [*carry, *(_stack(column) for column in zip(*saved, strict=True))]
 
 
-def _roll(expansion, inner, arrays, eqn, length: int, inward: bool, parents, most: int) -> list | None:
-    """The results of a loop in native code; None where it is short enough to be written out."""
-    sizes = np.cumsum([len(x) for x in arrays]).tolist()
-    of_inputs, of_results = [x.aval.dtype for x in eqn.invars], [x.aval.dtype for x in eqn.outvars]
-    dtypes = [
-        of_inputs[: sizes[0]],
-        of_inputs[sizes[0] : sizes[1]],
-        of_inputs[sizes[1] :],
-        of_results[len(arrays[1]) :],
-    ]
+def _roll(expansion, body: ClosedJaxpr, arrays, eqn, length: int, inward: bool, parents, most: int) -> list | None:
+    """Results of a loop as a call of a subprogram; None where it is short enough to be written out.
 
-    def body(graph, consts, carries, rows):
-        return expansion.evaluate_in(graph, inner, [*consts, *carries, *rows])
+    **Arguments:**
 
-    return roll(expansion.graph, body, arrays, dtypes, length, inward, parents, most)
+    - `body`: the jaxpr of one iteration, from constants, carries and a row of each array to carries and rows.
+    - `arrays`: constants, carries, and rows (length, ...).
+    - `most`: operations of a loop that is written out.
+
+    **Returns:** carries, and rows (length, ...), as those of `lax.scan`.
+    """
+    consts, carries, rows = ([as_objects(x) if x.dtype.kind == "O" else x for x in group] for group in arrays)
+    of_consts, of_carries, of_rows = split_by_counts([x.aval.dtype for x in eqn.invars], [len(x) for x in arrays])
+    of_results = [x.aval.dtype for x in eqn.outvars[len(carries) :]]
+    consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, of_consts, strict=True)]
+    rows = [_group(_columns(x), x[0, ...], d) for x, d in zip(rows, of_rows, strict=True)]
+    classes = _Classes([as_objects(x) for x in carries], of_carries)
+    while True:
+        inner, types = Graph(expansion.graph.most), []
+
+        def make(arrays, inner=inner, types=types):
+            first = len(types)
+            types.extend(arrays)
+            return [inner.inputs(first + i, x) for i, x in enumerate(arrays)]
+
+        own_consts = make([Array((len(x.passed),), x.dtype) for x in consts if x.passed])
+        own_carries = make(classes.types)
+        own_rows = make([Array((len(x.passed),), x.dtype) for x in rows if x.passed])
+        own_tables = make([Array((len(x.known),), x.dtype) for x in rows if x.known])
+        of_constants, of_passed, of_known = iter(own_consts), iter(own_rows), iter(own_tables)
+        given = [
+            *(x.entries(of_constants, None) for x in consts),
+            *classes.entries(own_carries),
+            *(x.entries(of_passed, of_known) for x in rows),
+        ]
+        results = [as_objects(x) for x in expansion.evaluate_in(inner, body, given)]
+        ends, outs = results[: len(carries)], results[len(carries) :]
+        if not classes.refine(ends):
+            break
+    distinct = [_distinct(x.ravel().tolist()) for x in outs]
+    carried = classes.outputs(ends)
+    kept = [i for i, (first, _) in enumerate(distinct) if first]
+    made = [objects([outs[i].ravel()[k] for k in distinct[i][0]], (len(distinct[i][0]),)) for i in kept]
+    outputs = [*classes.types, *(Array(x.shape, np.dtype(of_results[i])) for i, x in zip(kept, made, strict=True))]
+    program = inner.finish(types, outputs, [*carried, *made])
+    # A call counts as one operation: its code exists once. A loop of long iterations would compile for as long as what is written
+    # out, which then is refused as too long.
+    if len(program.operations) * length <= most or (most and len(program.operations) > MAX_LOOP_BODY):
+        return None
+    tables = [np.stack([np.array(y, x.dtype) for y in x.known], 1) for x in rows if x.known]
+    counts = Counts(len(own_consts), len(carried), len(own_rows), len(tables), 0, len(kept))
+    scan = Scan(program, counts, length, tables, inward, parents)
+    passed = [np.stack([objects(y, (len(y),)) for y in x.passed], 1) for x in rows if x.passed]
+    consts = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
+    found = scan.call(expansion.graph, [*consts, *classes.starts(), *passed])
+    by_place = dict(zip(kept, found[len(carried) :], strict=True))
+    stacked = []
+    for i, (out, (_, places)) in enumerate(zip(outs, distinct, strict=True)):
+        full = np.empty((length, out.size), object)
+        for k, (x, place) in enumerate(zip(out.ravel().tolist(), places, strict=True)):
+            full[:, k] = x if place is None else by_place[i][:, place]
+        stacked.append(full.reshape(length, *out.shape))
+    return [*classes.entries(found[: len(carried)]), *stacked]
 
 
 def sweep(expansion, params, args, eqn):
@@ -113,139 +161,47 @@ def while_loop(expansion, params, args, eqn):
         (going,) = expansion.evaluate(params["cond_jaxpr"], [*of_cond, *carry])
         going = as_objects(going).item()
         if type(going) is Number:
-            return _roll_while(expansion, params, of_cond, of_body, carry, eqn)
+            return _roll_while(expansion, params, [of_cond, of_body, carry], eqn)
         if not going:
             return carry
         carry = expansion.evaluate(params["body_jaxpr"], [*of_body, *carry])
 
 
-def _roll_while(expansion, params, of_cond, of_body, carry, eqn) -> list:
-    """The carries at the end of a loop whose number of iterations is not known."""
+def _roll_while(expansion, params, arrays: Sequence[Sequence], eqn) -> list:
+    """The carries at the end of a loop whose number of iterations is not known, as a call of a subprogram."""
+    of_cond, of_body, carries = ([as_objects(x) if x.dtype.kind == "O" else x for x in group] for group in arrays)
     types = [x.aval.dtype for x in eqn.invars]
-    count = len(of_cond) + len(of_body)
+    consts = [*of_cond, *of_body]
+    consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, types, strict=False)]
+    classes = _Classes([as_objects(x) for x in carries], types[len(consts) :])
 
-    def condition(graph, consts, carries):
-        return expansion.evaluate_in(graph, params["cond_jaxpr"], [*consts[: len(of_cond)], *carries])
+    def start():
+        """A graph, the types of its inputs, constants and carries."""
+        inner = Graph(expansion.graph.most)
+        types = [*(Array((len(x.passed),), x.dtype) for x in consts if x.passed), *classes.types]
+        made = [inner.inputs(i, x) for i, x in enumerate(types)]
+        count = len(types) - len(classes.types)
+        of_constants = iter(made[:count])
+        return inner, types, [x.entries(of_constants, None) for x in consts], classes.entries(made[count:])
 
-    def body(graph, consts, carries):
-        return expansion.evaluate_in(graph, params["body_jaxpr"], [*consts[len(of_cond) :], *carries])
-
-    arrays, dtypes = ([*of_cond, *of_body], carry), (types[:count], types[count:])
-    return roll_while(expansion.graph, condition, body, arrays, dtypes)
+    while True:
+        inner, types, own, own_carries = start()
+        given = [*own[len(of_cond) :], *own_carries]
+        ends = [as_objects(x) for x in expansion.evaluate_in(inner, params["body_jaxpr"], given)]
+        if not classes.refine(ends):
+            break
+    program = inner.finish(types, classes.types, classes.outputs(ends))
+    inner, types, own, own_carries = start()
+    (going,) = expansion.evaluate_in(inner, params["cond_jaxpr"], [*own[: len(of_cond)], *own_carries])
+    until = inner.finish(types, [Array((), np.dtype(bool))], [as_objects(going)])
+    passed = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
+    counts = Counts(len(passed), len(classes.types), 0, 0, 0, 0)
+    scan = Scan(program, counts, GUESSED_ITERATIONS, condition=until)
+    return classes.entries(scan.call(expansion.graph, [*passed, *classes.starts()]))
 
 
 def _add(expansion, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return as_objects(expansion.elementwise["add"](as_objects(x), as_objects(y)))
-
-
-# --- loops as subprograms ---
-
-
-def roll(
-    graph: Graph,
-    body: Callable,
-    arrays: Sequence[Sequence],
-    dtypes: Sequence[Sequence],
-    length: int,
-    inward: bool,
-    parents,
-    most: int,
-) -> list | None:
-    """Results of a loop as a call of a subprogram; None where it is short enough to be written out.
-
-    **Arguments:**
-
-    - `body(graph, consts, carries, rows)`: results of one iteration, carries and then rows, in a graph of its own.
-    - `most`: operations of a loop that is written out.
-    - `arrays`, `dtypes`: of constants, carries, and rows (length, ...); `dtypes` also of the rows that are results.
-
-    **Returns:** carries, and rows (length, ...), as those of `lax.scan`.
-    """
-    consts, carries, rows = ([as_objects(x) if x.dtype.kind == "O" else x for x in group] for group in arrays)
-    of_consts, of_carries, of_rows, of_results = dtypes
-    consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, of_consts, strict=True)]
-    rows = [_group(_columns(x), x[0, ...], d) for x, d in zip(rows, of_rows, strict=True)]
-    classes = _Classes([as_objects(x) for x in carries], of_carries)
-    while True:
-        inner, types = Graph(graph.most), []
-
-        def make(arrays, inner=inner, types=types):
-            first = len(types)
-            types.extend(arrays)
-            return [inner.inputs(first + i, x) for i, x in enumerate(arrays)]
-
-        own_consts = make([Array((len(x.passed),), x.dtype) for x in consts if x.passed])
-        own_carries = make(classes.types)
-        own_rows = make([Array((len(x.passed),), x.dtype) for x in rows if x.passed])
-        own_tables = make([Array((len(x.known),), x.dtype) for x in rows if x.known])
-        of_passed, of_known = iter(own_rows), iter(own_tables)
-        given = (
-            [x.entries(iter(y), None) for x, y in _pairs(consts, own_consts)],
-            classes.entries(own_carries),
-            [x.entries(of_passed, of_known) for x in rows],
-        )
-        results = [as_objects(x) for x in body(inner, *given)]
-        ends, outs = results[: len(carries)], results[len(carries) :]
-        if not classes.refine(ends):
-            break
-    distinct = [_distinct(x.ravel().tolist()) for x in outs]
-    carried = classes.outputs(ends)
-    kept = [i for i, (first, _) in enumerate(distinct) if first]
-    made = [objects([outs[i].ravel()[k] for k in distinct[i][0]], (len(distinct[i][0]),)) for i in kept]
-    outputs = [*classes.types, *(Array(x.shape, np.dtype(of_results[i])) for i, x in zip(kept, made, strict=True))]
-    program = inner.finish(types, outputs, [*carried, *made])
-    # A call counts as one operation: its code exists once. A loop of long iterations would compile for as long as what is written
-    # out, which then is refused as too long.
-    if len(program.operations) * length <= most or (most and len(program.operations) > MAX_LOOP_BODY):
-        return None
-    tables = [np.stack([np.array(y, x.dtype) for y in x.known], 1) for x in rows if x.known]
-    counts = Counts(len(own_consts), len(carried), len(own_rows), len(tables), 0, len(kept))
-    scan = Scan(program, counts, length, tables, inward, parents)
-    passed = [np.stack([objects(y, (len(y),)) for y in x.passed], 1) for x in rows if x.passed]
-    consts = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
-    found = scan.call(graph, [*consts, *classes.starts(), *passed])
-    by_place = dict(zip(kept, found[len(carried) :], strict=True))
-    stacked = []
-    for i, (out, (_, places)) in enumerate(zip(outs, distinct, strict=True)):
-        full = np.empty((length, out.size), object)
-        for k, (x, place) in enumerate(zip(out.ravel().tolist(), places, strict=True)):
-            full[:, k] = x if place is None else by_place[i][:, place]
-        stacked.append(full.reshape(length, *out.shape))
-    return [*classes.entries(found[: len(carried)]), *stacked]
-
-
-def roll_while(
-    graph: Graph, condition: Callable, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence]
-) -> list:
-    """Carries at the end of a `lax.while_loop`, as a call of a subprogram.
-
-    **Arguments:** `condition(graph, consts, carries)` and `body(graph, consts, carries)`: results of one iteration. `arrays`,
-    `dtypes`: of constants and carries.
-    """
-    consts, carries = ([as_objects(x) if x.dtype.kind == "O" else x for x in group] for group in arrays)
-    consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, dtypes[0], strict=True)]
-    classes = _Classes([as_objects(x) for x in carries], dtypes[1])
-
-    def inputs():
-        inner = Graph(graph.most)
-        types = [*(Array((len(x.passed),), x.dtype) for x in consts if x.passed), *classes.types]
-        made = [inner.inputs(i, x) for i, x in enumerate(types)]
-        count = len(types) - len(classes.types)
-        own = [x.entries(iter(y), None) for x, y in _pairs(consts, made[:count])]
-        return inner, types, own, classes.entries(made[count:])
-
-    while True:
-        inner, types, *given = inputs()
-        ends = [as_objects(x) for x in body(inner, *given)]
-        if not classes.refine(ends):
-            break
-    program = inner.finish(types, classes.types, classes.outputs(ends))
-    inner, types, *given = inputs()
-    until = inner.finish(types, [Array((), np.dtype(bool))], [as_objects(condition(inner, *given)[0])])
-    passed = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
-    counts = Counts(len(passed), len(classes.types), 0, 0, 0, 0)
-    scan = Scan(program, counts, GUESSED_ITERATIONS, condition=until)
-    return classes.entries(scan.call(graph, [*passed, *classes.starts()]))
 
 
 def _distinct(entries: list) -> tuple[list[int], list[int | None]]:
@@ -310,12 +266,6 @@ def _group(columns: list[list], one: np.ndarray, dtype) -> _Group:
             places.append(("known", known.setdefault(key, len(known))))
         by_key[key] = column
     return _Group(one.shape, np.dtype(dtype), places, [by_key[x] for x in passed], [by_key[x] for x in known])
-
-
-def _pairs(groups: Sequence[_Group], inputs: list):
-    """Groups with the array that each takes, if it takes one."""
-    at = iter(inputs)
-    return [(x, [next(at)] if x.passed else []) for x in groups]
 
 
 # --- carries ---

@@ -14,7 +14,7 @@ that of an inward one is outward; constants and sums change places too. So deriv
 import functools
 import hashlib
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,23 +24,10 @@ from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.code import ATTRIBUTES, ScanText
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import arrays_of, replay
-from jaxdyn.compile.program import Array, Constant, Program, as_objects, is_number
+from jaxdyn.compile.program import Array, Constant, Program, as_objects, derived, is_number
 
 # Operations beyond which a loop is not written out. LLVM takes some 50 microseconds for each: one second.
 MAX_WRITTEN_OUT = 20_000
-
-
-def _once(derive_scan: Callable) -> Callable:
-    """Keep what a method derives from a scan and hashable arguments; a decorator."""
-
-    @functools.wraps(derive_scan)
-    def call(scan, *args):
-        key = (derive_scan.__name__, *args)
-        if key not in scan.derived:
-            scan.derived[key] = derive_scan(scan, *args)
-        return scan.derived[key]
-
-    return call
 
 
 class Counts(NamedTuple):
@@ -101,7 +88,7 @@ class Scan:
         few, places = self._with_read_inputs()
         return graph.call(few, [arrays[i] for i in places])
 
-    @_once
+    @derived
     def _with_read_inputs(self) -> tuple["Scan", list[int]]:
         if self.condition is not None:
             return self, list(range(len(self.inputs)))
@@ -122,7 +109,7 @@ class Scan:
             i for group in kept[:3] for i in group
         ]
 
-    @_once
+    @derived
     def with_outputs(self, needed: tuple[bool, ...]) -> "Scan":
         """The scan of its carries and of those of its other outputs that are needed."""
         kept = [i for i, flag in enumerate(needed) if flag or i < self.counts.carries]
@@ -198,7 +185,7 @@ class Scan:
             ]
         return entries_of(outs), entries_of(out_steps)
 
-    @_once
+    @derived
     def _tangent(self, moving: tuple[bool, ...]) -> tuple["Scan", tuple[bool, ...]]:
         """The scan of values and changes, and which of the inputs and then of the outputs change."""
         body, tables = self.body, self.split_inputs(self.body.inputs)[3]
@@ -248,7 +235,7 @@ class Scan:
             )
         return TransposedCall(graph, self, values)
 
-    @_once
+    @derived
     def split_linear(self, linear: tuple[bool, ...]) -> "Linear":
         """The scan of what does not depend on the inputs that are `linear`, and the linear scan of the rest."""
         body, tables = self.body, self.counts.tables
@@ -262,7 +249,7 @@ class Scan:
         consts, carries, rows, at_tables = self.split_inputs(range(len(body.inputs)))
         own_carries = where_flag(carries, l_carries, False)
         places = [*where_flag(consts, l_consts, False), *own_carries, *where_flag(rows, l_rows, False), *at_tables]
-        first = rewrite(body, places, index_of_flag(outputs, False), own_carries)
+        first = rewrite(body, places, where_flag(range(len(outputs)), outputs, False), own_carries)
         counts = Counts(
             l_consts.count(False), len(own_carries), l_rows.count(False), tables, l_sums.count(False),
             l_results.count(False) + len(own_carries),
@@ -279,18 +266,13 @@ class Scan:
         places = [i for group in groups for i in group]
         sizes = [len(x) for x in groups]
         counts = Counts(sizes[0], sizes[1], sizes[2], sizes[3], sum(l_sums), sum(l_results))
-        rest = self._like(rewrite(body, places, index_of_flag(outputs, True)), counts)
+        rest = self._like(rewrite(body, places, where_flag(range(len(outputs)), outputs, True)), counts)
         return Linear(fixed, rest, tuple(is_linear[i] for i in places), l_carries, outputs)
 
-    def depending_entries(self, flags: list[bool]) -> list[bool]:
-        """Flags of the entries of the outputs that depend on these entries of the inputs, decided by arrays."""
-        outputs = self.split_linear(tuple(bool(x.any()) for x in arrays_of(self.inputs, flags))).outputs
-        return [flag for flag, array in zip(outputs, self.outputs, strict=True) for _ in range(array.size)]
-
-    @_once
+    @derived
     def transpose(self, linear: tuple[bool, ...]) -> "Scan":
         """The transpose of a scan whose body is linear in these inputs, all carries among them."""
-        backwards = derive.transpose(self.body, linear, [True] * len(self.body.outputs))
+        backwards = derive.transpose(self.body, linear, (True,) * len(self.body.outputs))
         l_consts, _, l_rows, _ = self.split_inputs(linear)
         c, s, y, t = self.counts.carries, self.counts.sums, self.counts.results, self.counts.tables
         fixed = l_consts.count(False), l_rows.count(False)
@@ -387,11 +369,6 @@ def where_flag(values: Sequence, flags: Sequence[bool], which: bool = True) -> l
     return [x for x, flag in zip(values, flags, strict=True) if flag == which]
 
 
-def index_of_flag(flags: Sequence[bool], which: bool) -> list[int]:
-    """Places of the flags that are `which`."""
-    return [i for i, flag in enumerate(flags) if flag == which]
-
-
 def with_changes(values: Sequence, changes: Sequence, flags: Sequence[bool]) -> list:
     """Values, and the changes of those with a flag."""
     return [*values, *where_flag(changes, flags)]
@@ -430,8 +407,10 @@ def depending_outputs(body: Program, linear: Sequence[bool]) -> list[bool]:
             varies.append(varies[args[0]][args[1].value])
         else:
             found: Any = [type(x) is not Constant and varies[x] for x in args]
-            if op == "call" and any(found) and hasattr(called := body.subprograms[args[0].value], "depending_entries"):
-                varies.append(called.depending_entries(found[1:]))
+            if op == "call" and any(found) and isinstance(called := body.subprograms[args[0].value], Scan):
+                # Decided by arrays, and then for each entry of the outputs.
+                flags = called.split_linear(tuple(bool(x.any()) for x in arrays_of(called.inputs, found[1:]))).outputs
+                varies.append([flag for flag, x in zip(flags, called.outputs, strict=True) for _ in range(x.size)])
             else:
                 varies.append(any(found))
     return [any(varies[x] for x in row if type(x) is not Constant) for row in body.results]

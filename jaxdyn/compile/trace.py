@@ -21,46 +21,46 @@ from jaxdyn.compile.program import Array, NotNumbers, Program, TooLong
 from jaxdyn.compile.rules import change_along, guarded_p, has_marks
 
 
-def program_of(
-    function: Callable,
-    static: tuple,
-    tree,
-    args: tuple,
-    *,
-    tangent: Callable | None = None,
-    most: int | None = None,
-    calls: bool = False,
-    flags: str = "refuse",
-    fallback: Callable | None = None,
-):
+def program_of(function: Callable, static: tuple, tree, args: tuple, **how):
     """Flat operands of a function's kernel, and (its program, the structure of its results) or the reason why there is none.
 
     **Arguments:**
 
     - `function(*static, tree, *args)`: pure, of one sample. `static` is hashable.
     - `tree`: pytree whose known leaves are compiled in; its traced leaves, and all of `args`, are operands.
-    - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
-    - `most`: operations beyond which there is no program; by default as `mode` says.
-    - `calls`: whether long functions under `jax.jit` become subprograms.
-    - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the
-      function itself, which is traced when the first of them appears (see `careful`).
+    - `how`: the options of `trace_program`.
     """
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
     # Within `shard_map` operands of a primitive vary along the same axes of a mesh, or JAX refuses them.
     leaves = jax_adapter.vary_alike([*map(jnp.asarray, (*traced, *leaves))])
     shapes = tuple((x.shape, x.dtype) for x in leaves)
-    how = tangent, most, calls, flags, fallback
-    return leaves, trace_program(function, static, known, len(traced), structure, shapes, *how)
+    return leaves, trace_program(function, static, known, len(traced), structure, shapes, **how)
 
 
-def trace_program(function, static, known: Known, count, structure, shapes, tangent=None, most=None,
-                  calls=False, flags="refuse", fallback=None):  # fmt: skip
-    """The program and the structure of its results, or the reason why there is none; `count`: traced leaves of the tree."""
+def trace_program(
+    *parts,
+    tangent: Callable | None = None,
+    most: int | None = None,
+    calls: bool = False,
+    flags: str = "refuse",
+    fallback: Callable | None = None,
+):
+    """The program and the structure of its results, or the reason why there is none.
+
+    **Arguments:**
+
+    - `parts`: function, static arguments, `Known` leaves of the tree and the number of its traced ones, structure of the other
+      arguments, shapes and dtypes of all operands.
+    - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
+    - `most`: operations beyond which there is no program; by default as `mode` says.
+    - `calls`: whether long functions under `jax.jit` become subprograms.
+    - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the
+      function itself, which is traced when the first of them appears (see `careful`).
+    """
     # A trace depends on these settings too: they are a part of the key under which the program is kept.
     context = jax.config.read("jax_enable_x64"), mode.state_of_programs()
-    how = tangent, most, calls, flags, fallback
-    return _trace_program(function, static, known, count, structure, shapes, *how, context)
+    return _trace_program(*parts, tangent, most, calls, flags, fallback, context)
 
 
 @functools.lru_cache(maxsize=1024)

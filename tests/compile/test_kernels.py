@@ -676,7 +676,7 @@ def test_results_do_not_depend_on_the_level_of_the_compiler(width, monkeypatch):
     results = []
     for level in (0, 1):
         monkeypatch.setattr(objects, "_level", lambda level=level: level)
-        monkeypatch.setattr(objects, "wants_least_optimisation", lambda level=level: level == 0)
+        monkeypatch.setattr(objects, "wanted_options", lambda level=level: "" if level else "least")
         code, rows = objects.Code(objects.compile_text(text)), [np.empty((9, 4)), np.empty((9, 4))]
         data = (ctypes.c_void_p * 4)(*(y.ctypes.data for y in (A, x, *rows)))
         ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * 3)(code.address("kernel"))(data, 9, 0, 9)

@@ -96,8 +96,8 @@ def test_constrained_dynamics_and_its_derivatives(monkeypatch):
     assert_same(made, monkeypatch)
     moving = tangent(made, (True, True, True, False))
     assert_same(moving, monkeypatch)
-    linear = [i >= len(made.inputs) for i in range(len(moving.inputs))]
-    assert_same(transpose(moving, linear, [x.dtype.kind == "f" for x in moving.outputs]), monkeypatch)
+    linear = tuple(i >= len(made.inputs) for i in range(len(moving.inputs)))
+    assert_same(transpose(moving, linear, tuple(x.dtype.kind == "f" for x in moving.outputs)), monkeypatch)
 
 
 def test_calls_and_loops(monkeypatch):

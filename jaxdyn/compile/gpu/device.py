@@ -189,7 +189,10 @@ class Driver:
             raise Unsupported(
                 f"CUDA's driver is of version {_write_version(version)}, and kernels need {_write_version(MIN_DRIVER)} or newer"
             )
-        capabilities = [self._capability(self._ask("cuDeviceGet", i)) for i in range(self._ask("cuDeviceGetCount"))]
+        capabilities = []
+        for device in (self._ask("cuDeviceGet", i) for i in range(self._ask("cuDeviceGetCount"))):
+            major, minor = (self._ask("cuDeviceGetAttribute", which, device) for which in (_MAJOR, _MINOR))
+            capabilities.append(10 * major + minor)
         if not capabilities:
             raise Unsupported("CUDA's driver sees no device")
         # One text for all devices: PTX of an older architecture runs on a newer one.
@@ -217,10 +220,6 @@ class Driver:
         result = _INT()
         self.call(name, ctypes.byref(result), *args)
         return result.value
-
-    def _capability(self, device: int) -> int:
-        major, minor = (self._ask("cuDeviceGetAttribute", which, device) for which in (_MAJOR, _MINOR))
-        return 10 * major + minor
 
     @contextmanager
     def _context_of(self, stream: int | None) -> Iterator[None]:

@@ -427,13 +427,10 @@ def _text(name: str) -> str:
     head = f"define internal double @{name}({', '.join(f'double {x}' for x in names)}) #0 {{"
     lines = [head, *e.lines, f"  ret double {result}", "}", *e.declared.values()]
     if any("@jaxdyn_two_over_pi" in line for line in e.lines):
-        lines.append(_two_over_pi())
+        # A word of zeros and the first 1152 bits of 2/pi behind the point, more than float64's exponents and three words.
+        size = 64 * 18
+        value = (2 << 2 * size) // pi_with_bits(size)
+        words = [0, *((value >> size - 64 * (k + 1)) & (2**64 - 1) for k in range(18)), 0, 0]
+        data = ", ".join(f"i64 {w}" for w in words)
+        lines.append(f"@jaxdyn_two_over_pi = private constant [{len(words)} x i64] [{data}]")
     return "\n".join(lines)
-
-
-def _two_over_pi() -> str:
-    """A word of zeros and the first 1152 bits of 2/pi behind the point, more than float64's exponents and three words."""
-    size = 64 * 18
-    value = (2 << 2 * size) // pi_with_bits(size)
-    words = [0, *((value >> size - 64 * (k + 1)) & (2**64 - 1) for k in range(18)), 0, 0]
-    return f"@jaxdyn_two_over_pi = private constant [{len(words)} x i64] [{', '.join(f'i64 {w}' for w in words)}]"

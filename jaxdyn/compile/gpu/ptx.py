@@ -108,7 +108,11 @@ def module_ir(program, uniform: Sequence[bool]) -> str:
     thread = _thread_ir(program, uniform)
     _add(parts, thread)
     parts["attributes #2"] = 'attributes #2 = { alwaysinline nounwind "no-builtins" }'
-    _inline_single_calls(parts, called)
+    # LLVM writes functions out that are called once: what is passed stays in registers.
+    text = "\n".join(parts.values())
+    for symbol in (symbol_of(x, 1) for x in called):
+        if symbol in parts and text.count(f"call void @{symbol}(") == 1:
+            parts[symbol] = parts[symbol].replace(" #0 {", " #2 {", 1)
     text = "\n".join(parts.values())
     # LLVM has no such fence for GPUs, where nothing compares stores.
     text = text.replace('  fence syncscope("singlethread") release\n', "")
@@ -204,15 +208,6 @@ def _define(parts: dict[str, str], called: Sequence) -> None:
         text = library_text(name) if part.startswith("declare ") else None
         if text is not None:
             _add(parts, text)
-
-
-def _inline_single_calls(parts: dict[str, str], called: Sequence) -> None:
-    """Let LLVM write functions out that are called once: what is passed stays in registers."""
-    text = "\n".join(parts.values())
-    for x in called:
-        symbol = symbol_of(x, 1)
-        if symbol in parts and text.count(f"call void @{symbol}(") == 1:
-            parts[symbol] = parts[symbol].replace(" #0 {", " #2 {", 1)
 
 
 # --- the function of a thread ---
