@@ -176,7 +176,7 @@ def measure(name: str, scene, q, v, batch: int, rounds: int) -> list[dict]:
             state = (q, v) if count == 1 else (jnp.tile(q, (count, 1)), jnp.tile(v, (count, 1)))
             jax.block_until_ready(run(*state))
             calls[title] = lambda run=run, state=state: jax.block_until_ready(run(*state))
-        times = timing.time_interleaved(calls, rounds)
+        times = timing.time_alternately(calls, rounds)
         if count == 1 and "held" not in name and (found := exudyn_steps(scene, q, v, rounds)):
             print(f"{name}: positions after 50 steps of Exudyn differ by {found[1]:.1e} m", flush=True)
             calls["Exudyn, 50 steps"], times["Exudyn, 50 steps"] = None, {"best": found[0]}

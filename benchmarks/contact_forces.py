@@ -128,7 +128,7 @@ def main(argv=None):
                 error = np.abs(np.asarray(computed.x) - np.array(call())).max()
                 print(f"{kind}: forces differ from those of {name.split(',')[0]} by at most {error:.1e} N")
     calls |= others
-    times = timing.time_interleaved(calls, options.rounds)
+    times = timing.time_alternately(calls, options.rounds)
     cores, rows = len(os.sched_getaffinity(0)), []
     print("| solver | us a sample, best (median) | us a core | compile s |")
     print("|---|---|---|---|")

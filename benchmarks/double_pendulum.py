@@ -59,7 +59,7 @@ def main() -> None:
         key: lambda program=program, arguments=arguments: jax.block_until_ready(program(*arguments))
         for key, (program, arguments, _) in compiled.items()
     }
-    times = timing.time_interleaved(contestants, options.rounds)
+    times = timing.time_alternately(contestants, options.rounds)
     print(f"float64, batch {options.batch}")
     print(f"{'':24}{'operations':>12}{'sines, roots':>14}{'ns best':>10}{'ns median':>12}{'to model':>10}")
     rows = []

@@ -167,7 +167,7 @@ def measure(name, batch, dtype, rounds, functions):
                     calls[peer] = lambda run=executable: jax.block_until_ready(run(*args))
         # Who takes a second for one call is timed once, beside the loop: no mean over rounds changes that picture.
         slow = {peer: timing.once(calls.pop(peer)) for peer in list(calls) if timing.once(calls[peer]) > 1.0}
-        result = timing.time_interleaved(calls, rounds)
+        result = timing.time_alternately(calls, rounds)
         result |= {peer: {"best": seconds, "median": seconds} for peer, seconds in slow.items()}
         for entry in result.values():
             entry.update({key + "_us": 1e6 * entry.pop(key) / batch for key in ("best", "median")})
@@ -242,7 +242,7 @@ def in_loops(name, batch, calls, rounds):
     threads = min(THREADS, batch)
     q_, v_, tau_ = (np.asfortranarray(np.asarray(x, float).T) for x in (q_pin, v, tau))
     alone, scanned = (jax.jit(f).lower(model, q, v, tau).compile() for f in (several, repeated))
-    computed = timing.time_interleaved(
+    computed = timing.time_alternately(
         {
             "alone": lambda: jax.block_until_ready(alone(model, q, v, tau)),
             "in a scan": lambda: jax.block_until_ready(scanned(model, q, v, tau)),
@@ -292,7 +292,7 @@ def rollout(name, batch, rounds, steps=100, dt=1e-3):
         return jax.lax.scan(step, (q, v), None, length=steps)[0]
 
     executable, trace, build = compiled(jax.vmap(one), q, v, tau)
-    result = timing.time_interleaved({"rk4": lambda: jax.block_until_ready(executable(q, v, tau))}, rounds, least=0.0)[
+    result = timing.time_alternately({"rk4": lambda: jax.block_until_ready(executable(q, v, tau))}, rounds, least=0.0)[
         "rk4"
     ]
     row = {"robot": name, "batch": batch, "steps": steps, "trace_s": trace, "compile_s": build}

@@ -58,7 +58,7 @@ def main(argv=None) -> None:
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     print("| what | ms |\n|---|---|")
-    for name, x in timing.time_interleaved(cases(options.batch), options.rounds).items():
+    for name, x in timing.time_alternately(cases(options.batch), options.rounds).items():
         print(f"| {name} | {1e3 * x['best']:.2f} ({1e3 * x['median']:.2f}) |")
 
 

@@ -115,7 +115,7 @@ def main(argv=None) -> None:
         "constraintDynamics": there,
         "underactuated_inverse_dynamics": lambda: jax.block_until_ready(whole(*inputs)),
     }
-    times = timing.time_interleaved(calls, options.rounds)
+    times = timing.time_alternately(calls, options.rounds)
     cores, rows = len(os.sched_getaffinity(0)), {}
     for name, computed in times.items():
         rows[name] = [computed[key] / options.batch * 1e6 for key in ("best", "median")]

@@ -51,7 +51,7 @@ def main(argv=None) -> None:
         for batch in options.batch
         for count in COUNTS
     }
-    times = timing.time_interleaved({place: run for place, (run, _, _) in made.items()}, options.rounds)
+    times = timing.time_alternately({place: run for place, (run, _, _) in made.items()}, options.rounds)
     rows = []
     for kind, batch in dict.fromkeys(place[:2] for place in made):
         best = [1e6 * times[kind, batch, count]["best"] / batch for count in COUNTS]

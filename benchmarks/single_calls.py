@@ -54,7 +54,7 @@ def main(argv=None) -> None:
         | {"Pinocchio": peer},
     }
     for title, calls in cases.items():
-        times = timing.time_interleaved(calls | {"jit of an addition": lambda: floor(q).block_until_ready()}, rounds)
+        times = timing.time_alternately(calls | {"jit of an addition": lambda: floor(q).block_until_ready()}, rounds)
         print(f"{title}: " + ", ".join(f"{name} {x['best'] * 1e6:.2f}" for name, x in times.items()) + " us")
 
 

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from jaxdyn.reports import run
-from jaxdyn.reports.run import time_interleaved as time_interleaved
+from jaxdyn.reports.run import time_alternately as time_alternately
 
 OUT = Path(__file__).resolve().parent.parent / "out"
 

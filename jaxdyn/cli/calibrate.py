@@ -93,12 +93,12 @@ def run(args: argparse.Namespace) -> int:
     if fit.expected is not None and fit.rank < fit.expected:
         print(f"{fit.expected - fit.rank} directions stay as in the file; measure poses that differ more (--choose)")
     if out is not None:
-        save_urdf(with_measured_frames(fit), out)
+        save_urdf(add_measurement_frames(fit), out)
         print(f"Wrote {out}: the pose of {args.frame}_measured in axes of {_DEVICE} is the measured one.")
     return 0
 
 
-def with_measured_frames(fit: identify.GeometryFit) -> Model:
+def add_measurement_frames(fit: identify.GeometryFit) -> Model:
     """Calibrated model with two more frames: that of the measuring device in the world, and the measured one at the tool.
 
     The root stays where it is, because gravity is in its axes.

@@ -119,7 +119,7 @@ class Actuators(eqx.Module):
 
     def _forces(self, system: Model, q, v, control, activation) -> tuple[Array, Array]:
         """Force of each actuator (nu,), and the rows (nu, nv) along which they act."""
-        control = self._clipped(control, q.dtype)
+        control = self._clip(control, q.dtype)
         if self._active:
             low, high = jnp.asarray(self.activation_range, q.dtype).T
             # An integration step may overshoot the range slightly before the rate stops.
@@ -148,7 +148,7 @@ class Actuators(eqx.Module):
         activation = jnp.asarray(self._check_activation(activation), float)
         if not self._active:
             return activation
-        wanted = self._clipped(control, activation.dtype)[np.array(self._active, int)]
+        wanted = self._clip(control, activation.dtype)[np.array(self._active, int)]
         is_filter = np.array([self.dynamics[i] == "filter" for i in self._active])
         # Integrators have no time constant: a 0 in the file would divide by zero and give NaN in gradients.
         constant = jnp.where(is_filter, jnp.asarray(self.time_constant, activation.dtype), 1.0)
@@ -173,7 +173,7 @@ class Actuators(eqx.Module):
         """Places of the actuators with dynamics among all."""
         return [i for i, kind in enumerate(self.dynamics) if kind is not None]
 
-    def _clipped(self, control, dtype) -> Array:
+    def _clip(self, control, dtype) -> Array:
         if jnp.shape(control) != (len(self.names),):
             raise ValueError(
                 f"control has shape {jnp.shape(control)}, expected {(len(self.names),)}: one number for each of "

@@ -292,7 +292,7 @@ def contacts_with_ground(
 
     **Raises:** ValueError for chosen links without a shape, and for more than 64 contacts of "ground".
     """
-    grounds = [one for one in collisions if _is_ground(one) and _is_fixed(model, one)]
+    grounds = [one for one in collisions if _is_ground(one) and _is_static(model, one)]
     known = list(dict.fromkeys(str(one.frame) for one in collisions if one.frame is not None))
     chosen = known if isinstance(contacts, str) else list(contacts)
     for name in chosen:
@@ -304,7 +304,7 @@ def contacts_with_ground(
     counts = {name: sum(one.frame == name for one in collisions) for name in chosen}
     places = dict.fromkeys(chosen, 0)
     for one in collisions:
-        if _is_fixed(model, one):
+        if _is_static(model, one):
             if not _is_ground(one):
                 left.add(apart, [f"{one.frame or 'world'} (fixed)"])
             continue
@@ -348,7 +348,7 @@ def _is_ground(one: Collision) -> bool:
     return isinstance(one.solid, HeightField) or one.solid.kind == "plane"
 
 
-def _is_fixed(model: Model, one: Collision) -> bool:
+def _is_static(model: Model, one: Collision) -> bool:
     return one.frame is None or named_frame(model, one.frame)[0] < 0
 
 

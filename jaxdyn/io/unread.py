@@ -43,7 +43,7 @@ def _without_effect(words: str) -> dict[str, "Part | Left | None"]:
     return dict.fromkeys(words.split())
 
 
-def _left(words: str, of: str) -> dict[str, "Part | Left | None"]:
+def _report(words: str, of: str) -> dict[str, "Part | Left | None"]:
     return {tag: Left(f"<{tag}> of {of}") for tag in words.split()}
 
 
@@ -126,7 +126,7 @@ SDF_LINK = Part(
         "velocity_decay": Part(
             children={tag: Left("velocity decay of links", 0.0) for tag in ("linear", "angular")},
         ),
-        **_left("collision sensor plugin battery particle_emitter projector audio_source", "links"),
+        **_report("collision sensor plugin battery particle_emitter projector audio_source", "links"),
         # The base of a part is chosen by `canonical_link`.
         **_without_effect("visual light audio_sink self_collide must_be_base_link"),
     },
@@ -160,7 +160,7 @@ SDF_MODEL = Part(
         "pose": _POSE,
         "static": Part(),
         "enable_wind": Left("wind on models", False),
-        **_left("plugin gripper", "models"),
+        **_report("plugin gripper", "models"),
         **_without_effect("frame link joint model include self_collide allow_auto_disable"),
     },
 )
@@ -169,7 +169,7 @@ SDF_WORLD = Part(
     ("name", "namespace"),
     {
         "gravity": Part(),
-        **_left("plugin actor state population", "worlds"),
+        **_report("plugin actor state population", "worlds"),
         # Wind has an effect on the links that enable it.
         **_without_effect(
             "audio wind include magnetic_field atmosphere gui physics scene light frame joint model road"
@@ -177,7 +177,7 @@ SDF_WORLD = Part(
         **_without_effect("spherical_coordinates"),
     },
 )
-SDF_ROOT = Part(("version",), {**_left("actor", "files"), **_without_effect("world model light include frame joint")})
+SDF_ROOT = Part(("version",), {**_report("actor", "files"), **_without_effect("world model light include frame joint")})
 
 
 def unread_parts(file: XmlFile, elements: Iterable[tuple[Any, str, Part]]) -> dict[str, list[str]]:

@@ -82,8 +82,17 @@ class _Copies:
             return path
         found = _FIND.sub(lambda mark: self._folder(mark[1], path) or mark[0], text)
         found = found.replace("$(dirname)", str(path.parent))
-        found = _INCLUDE.sub(lambda mark: mark[1] + mark[2] + self._included(mark[3], path) + mark[2], found)
-        here.write_text(found, encoding="utf-8")
+
+        def include(mark: re.Match) -> str:
+            name, wanted = mark[3], path.parent / mark[3]
+            # A name with an expression is known to xacro alone; it is relative to the file itself.
+            if "${" in name or "$(" in name:
+                wanted = name if name.startswith(("$", "/")) else wanted
+            elif wanted.is_file():
+                wanted = self.copy(wanted)
+            return f"{mark[1]}{mark[2]}{wanted}{mark[2]}"
+
+        here.write_text(_INCLUDE.sub(include, found), encoding="utf-8")
         return here
 
     def restore(self, text: str) -> str:
@@ -91,13 +100,6 @@ class _Copies:
         for path, copy in self.done.items():
             text = text.replace(str(copy), str(path))
         return text
-
-    def _included(self, name: str, path: pathlib.Path) -> str:
-        # A name with an expression is known to xacro alone; it is relative to the file itself.
-        if "${" in name or "$(" in name:
-            return name if name.startswith(("$", "/")) else str(path.parent / name)
-        wanted = path.parent / name
-        return str(self.copy(wanted)) if wanted.is_file() else str(wanted)
 
     def _folder(self, name: str, path: pathlib.Path) -> str | None:
         if name in self.packages:

@@ -86,7 +86,7 @@ def draw(
             raise ValueError(f"multipliers has shape {lam.shape}, expected ({count},), one per row of the scene")
         # One motion with one row, as `forces` expects.
         motion = motion._replace(multipliers=np.broadcast_to(lam, (*motion.q.shape[:2], count)))
-    picture = _Picture(motion, shapes, ax, _named(motion.scene.system, frames, points))
+    picture = _Picture(motion, shapes, ax, _name_frames(motion.scene.system, frames, points))
     picture.show(-1)
     return picture.ax
 
@@ -129,7 +129,7 @@ def animate(
     _matplotlib()
     duration = float(np.ptp(np.asarray(solution.ts))) if hasattr(solution, "ts") else 0.0
     motion = motion_of(scene, solution, rows=max(2, round(duration / speed * fps) + 1), most=4)
-    picture = _Picture(motion, shapes, None, _named(motion.scene.system, frames, points))
+    picture = _Picture(motion, shapes, None, _name_frames(motion.scene.system, frames, points))
     images = picture.images()
     if path.suffix.lower() == ".gif":
         _write_gif(path, images, fps)
@@ -163,7 +163,7 @@ def _matplotlib() -> None:
         raise ImportError("drawings need matplotlib: pip install jaxdyn[plot]") from error
 
 
-def _named(model: Model, frames, points) -> list[tuple[str, str | None, np.ndarray, bool]]:
+def _name_frames(model: Model, frames, points) -> list[tuple[str, str | None, np.ndarray, bool]]:
     """Name, frame, point (3,) in it, and whether its axes are drawn, of what a picture names."""
     named = [(str(name), name, np.zeros(3), True) for name in ([frames] if isinstance(frames, str) else frames)]
     for name, place in (points or {}).items():

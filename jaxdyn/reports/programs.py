@@ -194,7 +194,7 @@ def prepare(case: Case) -> Prepared:
         return [np.asarray(x) for x in compiled(jnp.asarray(q, float), jnp.asarray(v, float), numbers)]
 
     # A known motion is preferred: a solution of our own shares our equations of motion.
-    return Prepared(case, scene, known or converged_reference(programs, values, case.reduces), programs, values)
+    return Prepared(case, scene, known or compute_reference(programs, values, case.reduces), programs, values)
 
 
 def observables(scene: Scene, q, v):
@@ -217,7 +217,7 @@ def largest_error(computed: np.ndarray, known: np.ndarray) -> np.ndarray:
     return np.max(np.abs(computed - known) / (1 + np.abs(known)), 1)
 
 
-def converged_reference(programs: Programs, values: Callable, reduces: bool = True) -> Reference:
+def compute_reference(programs: Programs, values: Callable, reduces: bool = True) -> Reference:
     """Reference solution at tolerances of 1e-13, with its error estimated by another integrator.
 
     That is method "reduced" for a scene with constraints that `reduces`, another solver for others. The two

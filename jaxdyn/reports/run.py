@@ -138,7 +138,7 @@ def measure(
             times[i] = {"best": passed, "median": passed, "rounds": 1}
         else:
             calls[i] = contestant.call
-    times |= time_interleaved(calls, rounds, most=most)
+    times |= time_alternately(calls, rounds, most=most)
     return [
         Record(
             scene=prepared.case.name,
@@ -164,7 +164,7 @@ def measure(
     ]
 
 
-def time_interleaved(contestants: dict, rounds: int = 20, least: float = 0.02, most: float = float("inf")) -> dict:
+def time_alternately(contestants: dict, rounds: int = 20, least: float = 0.02, most: float = float("inf")) -> dict:
     """Seconds per call of each contestant over several rounds: {name: {"best", "median", "rounds" (their number)}}.
 
     **Arguments:** `contestants`: {name: a function of no arguments that returns when its computation is done}. `least` (s): calls

@@ -82,8 +82,9 @@ def test_what_is_out_of_reach_is_met_as_near_as_can_be():
         jd.assemble(arm(target), GUESS, guesses=1)
     found = jd.assemble(arm(target), GUESS, atol=0.3, guesses=1)
     assert bool(found.success)
-    # A stretched arm is singular: along it the last steps are as short as the tolerance of the rank has them.
-    np.testing.assert_allclose(np.linalg.norm(Tip(target).position(None, found.q, 0.0)), far, rtol=5e-3)
+    # A stretched arm is singular: the search ends with the elbow 0.04 rad from straight, as the rank has a tolerance, and the
+    # distance grows with the square of that angle, by 2.4e-3 of itself.
+    np.testing.assert_allclose(np.linalg.norm(Tip(target).position(None, found.q, 0.0)), far, rtol=3e-3)
     for wrong in (-1.0, np.nan):
         with pytest.raises(ValueError, match="atol is"):
             jd.assemble(arm(target), GUESS, atol=wrong)
@@ -158,8 +159,8 @@ def test_far_guesses_end_at_the_least_change():
     )
     difference = (solve(guesses + 1e-6 * along).q - solve(guesses - 1e-6 * along).q) / 2e-6
     near = np.abs(difference).max(1) < 20  # not beside a guess from which two places are equally far
-    # Rounding of 1e-12 over the step, and slopes that change fast beside far guesses.
-    np.testing.assert_allclose(slopes[near], difference[near], rtol=1e-4, atol=1e-5)
+    # Rounding of 1e-14 over the step, and slopes that change fast near far guesses.
+    np.testing.assert_allclose(slopes[near], difference[near], rtol=1e-5, atol=1e-8)
     assert near.sum() > 95
     # Too far for the search: a code, and derivatives of NaN.
     with pytest.MonkeyPatch.context() as patch:

@@ -37,7 +37,7 @@ from jaxdyn.reports.references import (
     turntable,
     windows,
 )
-from jaxdyn.reports.run import Contestant, Motion, evaluations, ladder, measure, time_interleaved
+from jaxdyn.reports.run import Contestant, Motion, evaluations, ladder, measure, time_alternately
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import choose_solver
@@ -401,7 +401,7 @@ def test_interleaved_drops_who_is_slow():
     def call(name):
         calls[name] += 1
 
-    times = time_interleaved({name: lambda name=name: call(name) for name in calls}, 5, least=0.0, most=-1.0)
+    times = time_alternately({name: lambda name=name: call(name) for name in calls}, 5, least=0.0, most=-1.0)
     assert times["slow"]["rounds"] == times["fast"]["rounds"] == 3
     assert calls == {"slow": 5, "fast": 5}  # two to see how long it takes
     assert times["slow"]["best"] <= times["slow"]["median"]
