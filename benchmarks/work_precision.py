@@ -23,7 +23,7 @@ from benchmarks.fronts import TARGETS, beaten_by, cost_at
 from benchmarks.report_cases import PUBLISHED, cases
 from jaxdyn.model.description import table
 from jaxdyn.reports import Record, Report, report, write
-from jaxdyn.reports.page import figure
+from jaxdyn.reports.plotting import figure
 
 SCENES = ("andrews", "car_axis", "windows_40", "free_body", "rolling_disk")
 

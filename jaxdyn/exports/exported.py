@@ -17,21 +17,22 @@ from jaxdyn.compile.program import Program
 from jaxdyn.compile.standalone import DEGENERATE, Routine
 from jaxdyn.compile.standalone import HOST as HOST
 from jaxdyn.compile.standalone import TARGETS as TARGETS
-from jaxdyn.exports.arguments import (
+from jaxdyn.exports.files import write_files
+from jaxdyn.exports.interfaces import (
     Argument,
     arguments_of,
     batch_ir,
+    casadi_ir,
     check_identifier,
-    comment_on,
     fields_of,
     system_of,
 )
-from jaxdyn.exports.casadi import casadi_ir
-from jaxdyn.exports.files import write_files
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
 
 DERIVATIVES = ("jacobian",)
 ABIS = ("c", "casadi")
+_QUANTITIES = {"q": ("q", "q_units"), "v": ("v", "v_units"), "tau": ("v", "force_units"), "a": ("v", "a_units")}
 
 
 def export(
@@ -165,8 +166,14 @@ class Exported:
         return [*names, f"{self.name}_batch"] if self.batch else names
 
     def comment_on(self, name: str, size: int) -> str:
-        """Order and units of the entries of an argument."""
-        return comment_on(name, size, self._system)
+        """Order and units of the entries of an argument that is called q, v, a or tau; "" for others."""
+        if self._system is None or name not in _QUANTITIES:
+            return ""
+        columns = columns_of(self._system)
+        entries, units = (getattr(columns, key) for key in _QUANTITIES[name])
+        if len(entries) != size:  # an argument of that name that is something else
+            return ""
+        return ", ".join(f"{entry} [{unit}]" for entry, unit in zip(entries, units, strict=True))
 
     # --- calls from Python ---
 

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, LinkableFile, Triple
-from jaxdyn.exports.arguments import C_TYPES, Argument
+from jaxdyn.exports.interfaces import C_TYPES, Argument
 
 TOLERANCE = 1e-12  # of the test program, relative: other processors round fused operations otherwise
 _TOLERANCE_SINGLE = 1e-4  # a thousand roundings of float32, which accelerations of long chains lose

@@ -13,8 +13,7 @@ import numpy as np
 from jaxdyn.constraints.base import layout
 from jaxdyn.model.arguments import Checked
 from jaxdyn.model.configuration import columns_of
-from jaxdyn.reports.page import Record, panel
-from jaxdyn.reports.plotting import BLUE, RED, SERIES, Axes, bands, new_figure, style
+from jaxdyn.reports.plotting import BLUE, RED, SERIES, Axes, Record, bands, new_figure, panel, style
 from jaxdyn.simulation.solution import Solution, times
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike

@@ -25,8 +25,18 @@ from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.identify.uncertainty import Whiteness, whiteness
 from jaxdyn.model.tree import Model
-from jaxdyn.reports.page import document, svg, text_block
-from jaxdyn.reports.plotting import BLUE, GREY, RED, add_legend, joint_panels, new_figure, torque_figure
+from jaxdyn.reports.plotting import (
+    BLUE,
+    GREY,
+    RED,
+    add_legend,
+    document,
+    joint_panels,
+    new_figure,
+    svg,
+    text_block,
+    torque_figure,
+)
 
 
 class Evaluation(NamedTuple):

@@ -19,8 +19,7 @@ import numpy as np
 
 from jaxdyn.compile import wait_for_code
 from jaxdyn.constraints.codes import CODES, code_of
-from jaxdyn.reports.page import Record, Report, SceneReference, write
-from jaxdyn.reports.plotting import new_figure
+from jaxdyn.reports.plotting import Record, Report, SceneReference, new_figure, write
 from jaxdyn.reports.programs import FIXED, SOLVERS, Case, Prepared, case_of_scene, prepare
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.methods import Method

@@ -20,7 +20,7 @@ from jaxdyn.cli import main
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.reports import Record, Report, html_page, pareto_front
 from jaxdyn.reports import run as running
-from jaxdyn.reports.page import SceneReference
+from jaxdyn.reports.plotting import SceneReference
 from jaxdyn.reports.programs import FIXED, SOLVERS, Case, Programs, Reference, case_of_scene, prepare
 from jaxdyn.reports.references import (
     CLOSED_FORMS,
