@@ -228,7 +228,8 @@ def _check_signals(signals: dict) -> None:
             row = bad[0][0]
             column = "" if name == "t" else f", column {bad[0][1] + 1}"
             raise ValueError(
-                f"{name} is {np.asarray(value)[tuple(bad[0])]} at row {row}{column} ({len(bad)} such values)"
+                f"{name} is {np.asarray(value)[tuple(bad[0])]} at row {row}{column} ({len(bad)} such values); drop these rows, "
+                "or cut the log there"
             )
     t = np.asarray(signals["t"])
     back = np.flatnonzero(np.diff(t) <= 0)
