@@ -307,6 +307,7 @@ def _minimise(problem: _Problem, triangles, state: _State, start: np.ndarray) ->
     z = -np.linalg.lstsq(jacobian(zero)[:, :size], errors(zero), rcond=_RANK)[0]
     # Columns of unit length: neither steps nor the test for their end may depend on units.
     y = np.append(z, state.u)
-    tolerances = {"ftol": 1e-12, "xtol": 1e-10, "gtol": 1e-14}
-    end = least_squares(errors, y, jacobian, method="lm", x_scale="jac", max_nfev=_STEPS, **tolerances)
+    end = least_squares(
+        errors, y, jacobian, method="lm", x_scale="jac", max_nfev=_STEPS, ftol=1e-12, xtol=1e-10, gtol=1e-14
+    )
     return state._replace(z=end.x[:size], u=end.x[size:]), bool(end.success)
