@@ -305,9 +305,8 @@ def _minimise(problem: _Problem, triangles, state: _State, start: np.ndarray) ->
     # At fixed gains the errors are linear in the other unknowns.
     zero = np.append(np.zeros(size), state.u)
     z = -np.linalg.lstsq(jacobian(zero)[:, :size], errors(zero), rcond=_RANK)[0]
-    # Columns of unit length: neither steps nor the test for their end may depend on units.
-    y = np.append(z, state.u)
-    end = least_squares(
-        errors, y, jacobian, method="lm", x_scale="jac", max_nfev=_STEPS, ftol=1e-12, xtol=1e-10, gtol=1e-14
-    )
+    # Columns of unit length ("jac"): neither steps nor the test for their end may depend on units.
+    options: dict[str, Any] = {"jac": jacobian, "method": "lm", "x_scale": "jac", "max_nfev": _STEPS}
+    options |= {"ftol": 1e-12, "xtol": 1e-10, "gtol": 1e-14}
+    end: Any = least_squares(errors, np.append(z, state.u), **options)
     return state._replace(z=end.x[:size], u=end.x[size:]), bool(end.success)
