@@ -18,7 +18,7 @@ from jaxdyn.io.formats import format_of
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.configuration import columns_of, integrate
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model, inertia_report, repair_inertias
 
 HELP = "bodies, joints, limits, loops, frames and faulty inertias of a URDF, MJCF or SDF file"

@@ -31,8 +31,7 @@ from jaxdyn.constraints.redundancy import (
 )
 from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, check_mapping, check_state, zeros_if_none
-from jaxdyn.model.numbers import as_static, check_count
+from jaxdyn.model.arguments import Numbers, as_static, check_count, check_mapping, check_state, zeros_if_none
 from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, displace, displacement
 

@@ -24,7 +24,7 @@ from jaxdyn.constraints.base import (
 from jaxdyn.constraints.rank import REGULAR, eps_of, share
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene

@@ -28,16 +28,8 @@ from jaxdyn.constraints.rolling import Touching, TouchingPoint, check_has_rows, 
 from jaxdyn.contact.contact_equations import Patch, Steps, newton_steps, patch_at
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import (
-    Checked,
-    Number,
-    Numbers,
-    as_array,
-    check_body,
-    check_new_name,
-    check_shapes,
-    pose_leaf,
-)
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_body, check_new_name, check_shapes
+from jaxdyn.model.host_math import pose_leaf
 from jaxdyn.model.tree import Model
 
 

@@ -18,8 +18,7 @@ from jaxdyn.compile.known import as_numpy_if_known, is_concrete
 from jaxdyn.constraints.rolling import unit_or
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid, Sphere
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers
-from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.arguments import Numbers, as_float, as_number
 
 # Below this sine of its tilt, the lowest point of a cylinder moves from the rim to the axis, and inwards by this share of it.
 UPRIGHT, RECESS = 1e-3, 0.1

@@ -21,12 +21,12 @@ from jaxdyn.model.arguments import (
     Numbers,
     SystemLike,
     as_array,
+    as_number,
     check_body,
     check_name,
     check_new_name,
-    pose_leaf,
 )
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.host_math import pose_leaf
 from jaxdyn.systems.scene import Scene, as_pytree
 
 

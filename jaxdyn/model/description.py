@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import state_dtype
-from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.topology import SCREW_KINDS
 
 
 def tree_table(model) -> str:

@@ -20,6 +20,8 @@ from jaxdyn.model.arguments import (
     DType,
     Numbers,
     as_array,
+    as_float,
+    as_number,
     check_mapping,
     check_name,
     check_state,
@@ -27,7 +29,6 @@ from jaxdyn.model.arguments import (
     state_dtype,
     zeros_if_none,
 )
-from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene

@@ -19,7 +19,7 @@ from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import warn
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.hybrid.modes import elements_of, extend, force_at, normal_load
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky

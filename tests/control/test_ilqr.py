@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.constraints.base import position_residual
-from jaxdyn.control.box_qp import minimize_in_box
+from jaxdyn.contact.qp import minimize_in_box
 
 RNG = np.random.default_rng(4)
 A, B = np.eye(3) + 0.2 * RNG.normal(size=(3, 3)), RNG.normal(size=(3, 2))

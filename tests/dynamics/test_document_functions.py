@@ -14,7 +14,7 @@ import jaxdyn as jd
 from jaxdyn.dynamics.link_frame import newton_euler_matrices
 from jaxdyn.lie import so3
 from jaxdyn.model.configuration import configuration_rate
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 
 SEQUENCES = ["".join(s) for s in itertools.product("xyz", repeat=3) if s[1] not in (s[0], s[2])]
 

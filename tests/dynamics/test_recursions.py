@@ -16,7 +16,7 @@ from jaxdyn import neutral
 from jaxdyn.dynamics import recursions, scans
 from jaxdyn.dynamics import world_frame as matrix_form
 from jaxdyn.dynamics.recursions import frames, links, transforms
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 
 # Every kind, as a root, inside the tree and at its end; with and without armature.
 TREES = {
