@@ -15,7 +15,7 @@ import jaxdyn
 from jaxdyn import neutral
 from jaxdyn.dynamics import recursions, scans
 from jaxdyn.dynamics import world_frame as matrix_form
-from jaxdyn.dynamics.recursions import frames, links, transforms
+from jaxdyn.dynamics.recursions import frames
 from jaxdyn.model.topology import KINDS
 
 # Every kind, as a root, inside the tree and at its end; with and without armature.
@@ -265,26 +265,6 @@ def test_without_gravity_and_without_bodies():
     assert recursions.crba(empty, none).shape == recursions.mass_matrix_sqrt(empty, none).shape == (0, 0)
 
 
-def test_canonical_frames_are_the_home_poses():
-    """The factors of the home poses, multiplied, are the home poses; a first child's begins along x."""
-    for seed in range(3):
-        model = random_tree(seed, ["revolute", "helical", "revolute", "prismatic", "revolute", "planar", "revolute"])
-        computed = links.links_of(model)
-        chains = links.joint_transforms(computed, neutral(model))
-        first = set()
-        for i, chain in enumerate(chains):
-            pose = np.eye(4)
-            for step in chain:
-                R = np.eye(3) if step.rotation is None else step.rotation.matrix(3)
-                r = np.zeros(3) if step.shift is None else step.shift
-                pose = pose @ np.block([[np.asarray(R), np.asarray(r)[:, None]], [np.zeros(3), np.ones(1)]])
-            assert_close(pose, computed.frames.home[i], 1e-13)
-            parent = model.topology.parents[i]
-            if parent >= 0 and parent not in first and model.topology.kinds[parent] != "planar":
-                assert computed.frames.screws[i].phi == (1, 0) and computed.frames.screws[i].e == 0
-            first.add(parent)
-
-
 def test_nearly_parallel_axes():
     """Common normals that lie far away are not used."""
     tilt = 1e-4
@@ -300,15 +280,3 @@ def test_masses_on_a_joint_axis_belong_to_the_parent():
     moments = frames.pseudo_inertias(model, frames.canonical_frames(model))
     for J, kind in zip(moments, model.topology.kinds, strict=True):
         assert not J[frames.SHARED[kind]].any()
-
-
-def test_congruence_by_twice_the_angle():
-    rng = np.random.default_rng(0)
-    for size in (4, 6):
-        A = rng.normal(size=(size, size))
-        A = A + A.T
-        for axis in (0, 1, 2):
-            turn = transforms.PlaneRotation(transforms.PlaneRotations(axis, np.cos([0.7]), np.sin([0.7])), 0)
-            R = turn.matrix(size)
-            assert_close(R @ R.T, np.eye(size), 1e-15)
-            assert_close(turn.congruence(A), R @ A @ R.T, 1e-14)
