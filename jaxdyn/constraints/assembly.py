@@ -22,12 +22,12 @@ from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import CLOSED, LEAST_GAP, check_tolerance, clear_pivot, tolerance
 from jaxdyn.constraints.redundancy import (
+    add_constraints,
     coordinate_sizes,
     keep_rows,
     largest_ratio,
     opening_of_redundant,
     row_limits,
-    row_mask,
 )
 from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
 from jaxdyn.lie.so3 import matmul
@@ -88,7 +88,7 @@ class Assembly(Outcome):
         """
         scene = as_scene(scene)
         held = {} if hold is None else {name: _first(value) for name, value in hold.items()}
-        whole = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in held.items())))
+        whole = add_constraints(scene, [lock_joint(*joint) for joint in held.items()])
         R, inverse = jax.vmap(lambda q: unit_rows(whole, q, t))(self.q)
         changes = jax.vmap(partial(changes_branch, scene.system))(self.q[:-1], self.q[1:], R[1:], R[:-1], inverse[:-1])
         return jnp.concatenate([jnp.zeros(1, bool), changes])
@@ -158,7 +158,7 @@ def assemble(
     hold = check_mapping(hold, "hold", '{"1": 0.5}')
     v = zeros_if_none(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in hold.items())))
+    locked = add_constraints(scene, [lock_joint(*joint) for joint in hold.items()])
     layout(locked)  # raises for joints that do not exist
     atol = None if atol is None else float(atol)
 
@@ -289,7 +289,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     kept = jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype)
     if selection is not None:
         locked, is_clear = _drop_rows(bare, selection, guess.dtype), jnp.asarray(selection.gap >= LEAST_GAP)
-        kept = row_mask(locked)
+        kept = locked.kept_rows.kept
     q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
         q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)

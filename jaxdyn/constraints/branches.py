@@ -128,5 +128,5 @@ def count_free(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
     inverse = pseudo_inverse(A, tolerance(rank_tol, A), True)
     is_clear = has_clear_rank(A, inverse, rank_tol)
     if has_selection(scene):
-        is_clear = is_clear & (scene.constraints[0].gap >= LEAST_GAP)
+        is_clear = is_clear & (scene.kept_rows.gap >= LEAST_GAP)
     return jnp.where(is_clear, scene.nv - rank_of(A, inverse), -1).astype(jnp.int32)

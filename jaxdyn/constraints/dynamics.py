@@ -33,7 +33,7 @@ from jaxdyn.constraints.rank import (
     regular_gram,
     tolerance,
 )
-from jaxdyn.constraints.redundancy import distribute_multipliers, has_selection, row_mask
+from jaxdyn.constraints.redundancy import distribute_multipliers, has_selection
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
@@ -195,7 +195,7 @@ def _gauss_problem(scene: Scene, q, v, tau, t):
 
 def _count_rows(scene: Scene) -> Array:
     """Number of rows that count, of independent ones."""
-    count = jnp.sum(row_mask(scene)) if has_selection(scene) else layout(scene)[-1].end
+    count = jnp.sum(scene.kept_rows.kept) if has_selection(scene) else layout(scene)[-1].end
     return jnp.asarray(count).astype(jnp.int32)
 
 

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import kernel
-from jaxdyn.compile.known import stop_gradient
+from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.base import (
     Constraint,
     constraint_jacobian,
@@ -23,72 +23,25 @@ from jaxdyn.constraints.base import (
 )
 from jaxdyn.constraints.rank import REGULAR, eps_of, share
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
 
 
-class KeptRows(Constraint):
-    """A constraint whose dropped rows are zero.
+class KeptRows(eqx.Module):
+    """The rows of a scene's constraints that count; the others are zero (`Scene.kept_rows`).
 
-    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`. `is_held`:
+    `kept` (nc,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`. `is_held`:
     whether the choice is the user's (`choose_rows`), which every function checks and renews.
     """
 
-    # Arrays, not static: another choice of rows in the course of a motion runs the same program. The three numbers belong to the
-    # scene; each constraint has them because a scene has no place of its own for them.
-    inner: Constraint
-    kept: Float[Array, " n"]
-    rounding: Float[Array, ""]
-    least: Float[Array, ""]
-    gap: Float[Array, ""]
-    name: str = eqx.field(static=True)
+    # Arrays, not static: another choice of rows in the course of a motion runs the same program.
+    kept: Float[Array | np.ndarray, " nc"]
+    rounding: Float[Array | np.ndarray, ""]
+    least: Float[Array | np.ndarray, ""]
+    gap: Float[Array | np.ndarray, ""]
     is_held: bool = eqx.field(static=True, default=False)
-
-    def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
-        """Residual of the inner constraint, zero in dropped rows."""
-        return self._mask_position(self.inner.position(system, q, t))
-
-    def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
-        """Residual of the inner constraint, zero in dropped rows."""
-        residual = self.inner.velocity(system, q, v, t)
-        # The nonholonomic rows of a constraint are its last ones, the holonomic rows its first ones.
-        return None if residual is None else residual * self.kept[-residual.shape[0] :].astype(q.dtype)
-
-    def sizes(self, system, dtype) -> tuple[int, int]:
-        """Numbers of rows of the inner constraint."""
-        return self.inner.sizes(system, dtype)
-
-    def wrench_components(self) -> tuple[int, ...] | None:
-        """Indices of the inner constraint."""
-        return self.inner.wrench_components()
-
-    def group(self):
-        """Key of the inner constraint's group, different from that of constraints with all rows."""
-        group = self.inner.group()
-        return None if group is None else ("kept rows", self.is_held, group)
-
-    def _mask_position(self, residual):
-        return None if residual is None else residual * self.kept[: residual.shape[0]].astype(residual.dtype)
-
-    @classmethod
-    def group_positions(cls, members: Sequence[Any], system, q, t) -> list:
-        """Residuals of the inner constraints, zero in dropped rows."""
-        inner = [member.inner for member in members]
-        residuals = inner[0].group_positions(inner, system, q, t)
-        return [member._mask_position(residual) for member, residual in zip(members, residuals, strict=True)]
-
-    @classmethod
-    def group_rows(cls, members: Sequence[Any], system, q, v, t) -> list:
-        """Rows of the inner constraints, zero where dropped."""
-        inner = [member.inner for member in members]
-        motions = []
-        for member, (A, gamma, velocity) in zip(members, inner[0].group_rows(inner, system, q, v, t), strict=True):
-            kept = member.kept.astype(q.dtype)
-            motions.append((kept[:, None] * A, kept * gamma, kept * velocity))
-        return motions
 
 
 class Selection(NamedTuple):
@@ -110,43 +63,44 @@ class Selection(NamedTuple):
 def keep_rows(scene: Scene, selection: Selection, *, is_held: bool = False) -> Scene:
     """The scene with the rows that are not kept set to zero."""
     kept, rounding, least, gap, _ = map(jnp.asarray, selection)
-    constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], rounding, least, gap, constraint.name, is_held)  # pyright: ignore[reportArgumentType]
-        for constraint, place in zip(scene.constraints, layout(scene), strict=True)
-    )
-    return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
+    return scene.with_kept_rows(KeptRows(kept, rounding, least, gap, is_held))
+
+
+def add_constraints(scene: Scene, more: Sequence[Constraint], forces: Sequence[Any] = ()) -> Scene:
+    """The system with the scene's constraints and, behind them, more, all of whose rows stay; with these forces alone."""
+    whole, rows = Scene(scene.system, (*scene.constraints, *more), forces), scene.kept_rows
+    if rows is None or not more:
+        return whole.with_kept_rows(rows)
+    # Known rows stay known within a trace.
+    xp = np if is_concrete(rows.kept) else jnp
+    stay = np.ones(layout(whole)[-1].end - rows.kept.size, rows.kept.dtype)
+    return whole.with_kept_rows(eqx.tree_at(lambda rows: rows.kept, rows, xp.concatenate([rows.kept, stay])))
 
 
 def has_selection(scene: Scene) -> bool:
     """True for a scene of `keep_rows`."""
-    return any(isinstance(constraint, KeptRows) for constraint in scene.constraints)
+    return scene.kept_rows is not None
 
 
 def holds_rows(scene: Scene) -> bool:
     """True for a scene of `choose_rows`."""
-    return any(isinstance(constraint, KeptRows) and constraint.is_held for constraint in scene.constraints)
+    return scene.kept_rows is not None and scene.kept_rows.is_held
 
 
 def exchange_rows(scene: Scene, rows: Float[Array, " n"]) -> Scene:
     """A scene of `keep_rows` with another choice of rows, in the form of `rows_of`."""
-    gap = scene.constraints[0].gap
-    return keep_rows(all_rows(scene), Selection(rows[:-1], scene.constraints[0].rounding, rows[-1], gap, gap))
+    old = scene.kept_rows
+    return scene.with_kept_rows(KeptRows(rows[:-1], old.rounding, rows[-1], old.gap))
 
 
 def all_rows(scene: Scene) -> Scene:
     """The scene with all of its rows, before `keep_rows`."""
-    constraints = tuple(c.inner if isinstance(c, KeptRows) else c for c in scene.constraints)
-    return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
-
-
-def row_mask(scene: Scene) -> Array:
-    """1 for rows that stay and 0 for dropped ones, (nc,), of a scene of `keep_rows`."""
-    return jnp.concatenate([c.kept for c in scene.constraints])
+    return scene.with_kept_rows(None)
 
 
 def rows_of(scene: Scene, dtype) -> Float[Array, " n"]:
     """The choice of rows as the vector that a step carries: 1 or 0 for each row, then `Selection.least`; a constant."""
-    return lax.stop_gradient(jnp.append(row_mask(scene), scene.constraints[0].least)).astype(dtype)
+    return lax.stop_gradient(jnp.append(scene.kept_rows.kept, scene.kept_rows.least)).astype(dtype)
 
 
 def largest_opening(scene: Scene, q, t, kept, v=None):
@@ -184,8 +138,8 @@ def residual_of_redundant(scene: Scene, q, v, t, a) -> Float[Array, ""]:
 
 def _constants(scene: Scene, q, t):
     """The scene with all of its rows and without forces, the mask of kept rows, q and t: without derivatives."""
-    whole = Scene(scene.system, all_rows(scene).constraints)
-    return stop_gradient((whole, row_mask(scene).astype(q.dtype), q, jnp.asarray(t, q.dtype)))
+    whole = Scene(scene.system, scene.constraints)
+    return stop_gradient((whole, scene.kept_rows.kept.astype(q.dtype), q, jnp.asarray(t, q.dtype)))
 
 
 def gap_of_redundant(scene: Scene, q, t) -> Float[Array, ""]:
@@ -203,7 +157,7 @@ def distribute_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Floa
     # Without this the loads of redundant bearings would depend on the choice of rows, and jump where it changes.
     if not has_selection(scene):
         return lam
-    kept, whole = row_mask(scene), all_rows(scene)
+    kept, whole = scene.kept_rows.kept, all_rows(scene)
     return _distribute(whole.without_forces, q, jnp.asarray(t, q.dtype), lam, kept)
 
 
@@ -228,7 +182,7 @@ def largest_of_each(scene: Scene, sizes) -> Array:
 def most_opening(scene: Scene, dtype):
     """Largest opening of dropped rows along a motion: a hundred times their opening or difference at its start, plus rounding."""
     # A hundred times, because the rounding of a file can cancel at the start: at the configuration in which it was written.
-    return 100 * scene.constraints[0].rounding + eps_of(jnp.zeros((), dtype)) ** REGULAR
+    return 100 * scene.kept_rows.rounding + eps_of(jnp.zeros((), dtype)) ** REGULAR
 
 
 # Tolerances of residuals, relative to the length of the mechanism.

@@ -11,7 +11,7 @@ to a few digits are never dependent to rounding of the dtype. So rank is a prope
 The number of independent rows is decided once. Their choice is renewed before a step, where the kept rows have become nearly
 dependent (`renew_rows`).
 
-A dropped row stays in its place as a row of zeros (`KeptRows`), so that shapes, names and multipliers are those of the scene.
+A dropped row stays in its place as a row of zeros (`Scene.kept_rows`): shapes, names and multipliers are those of the scene.
 """
 
 from collections.abc import Callable
@@ -105,7 +105,7 @@ def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene
     values below the tolerance count as zero.
     """
     if holds_rows(scene):
-        return all_rows(scene) if rank_tol is not None else keep_rows(all_rows(scene), _held_selection(scene, q, t))
+        return all_rows(scene) if rank_tol is not None else keep_rows(scene, _held_selection(scene, q, t))
     if not (scene.rounding and scene.constraints) or rank_tol is not None or has_selection(scene):
         return scene
     selection = select_rows(scene, q, t)
@@ -131,8 +131,7 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
     Source: docs/constraints.md, redundant rows.
     """
     scene = as_scene(scene)
-    if has_selection(scene):
-        scene = all_rows(scene)
+    scene = all_rows(scene)
     q, t = check_state(scene.system, q=q, t=t)
     selection = select_rows(scene, q, t)
     if is_concrete(selection):
@@ -148,7 +147,7 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
 
 def _held_selection(scene: Scene, q, t) -> Selection:
     """The choice that a scene of `choose_rows` holds, made again where it is poor."""
-    held, rows = scene.constraints[0], renew_rows(scene, q, t, False)
+    held, rows = scene.kept_rows, renew_rows(scene, q, t, False)
     gap = held.gap
     if scene.rounding:
         # In a singular position no choice is good, and rounding hides which rows are independent there.
@@ -166,7 +165,7 @@ def rank_code(scene: Scene, result: Any) -> Any:
     """The result, or `unclear_rank` where kept and dropped rows of a scene of `independent_rows` differ too little."""
     if not has_selection(scene):
         return result
-    is_clear = scene.constraints[0].gap >= LEAST_GAP
+    is_clear = scene.kept_rows.gap >= LEAST_GAP
     return RESULTS.where(is_clear, result, RESULTS.unclear_rank)
 
 

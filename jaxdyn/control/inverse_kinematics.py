@@ -25,7 +25,7 @@ from jaxdyn.constraints.branches import changes_branch, unit_rows
 from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.rank import condition_number, rank_of
-from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant
+from jaxdyn.constraints.redundancy import KeptRows, add_constraints, has_selection, opening_of_redundant
 from jaxdyn.constraints.selection import independent_rows, most_rounding
 from jaxdyn.control.targets import (
     TASKS,
@@ -37,7 +37,6 @@ from jaxdyn.control.targets import (
     row_weights,
     screw_joints,
     search,
-    target_rows,
 )
 from jaxdyn.model.arguments import Checked, Number, Numbers, check_flag, check_state
 from jaxdyn.model.tree import Model
@@ -144,7 +143,7 @@ def inverse_kinematics(
     factors = row_weights(rows, weights, guess.dtype)
     # Forces and cones do not affect configurations: they are left out, so that others do not cause a second compilation.
     place = _solve(
-        Scene(model, scene.constraints),
+        scene.without_forces,
         rows,
         guess,
         factors,
@@ -170,7 +169,7 @@ def inverse_kinematics(
 def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
     model, every = scene.system, scene
     scene = independent_rows_near(scene, guess, t)
-    whole = Scene(model, (*scene.constraints, *rows))
+    whole = add_constraints(scene, rows)
     # The search is not differentiated: `_differentiable` attaches the derivatives of its result.
     fixed, start, factors, time = stop_gradient((whole, guess, factors, t))
     aims = aims_of(fixed, len(scene.constraints), factors, limits, atol)
@@ -228,14 +227,12 @@ def _with_derivatives(scene: Scene, guess, place, is_nearest, t: Number):
 def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints: int):
     """q as the configuration nearest to itself, or to a posture, that reaches the targets, with its derivatives."""
     model: Model = whole.system
-    is_counted, first = aims.tolerances > 0, int(aims.is_exact.size)
-    rows = list(whole.constraints)
-    for i in reversed(range(constraints, len(rows))):
-        first -= sum(target_rows(rows[i]))
-        # Rows of weight zero are masked: q does not satisfy them, so that they have no derivative there.
-        counted = is_counted[first : first + sum(target_rows(rows[i]))].astype(q.dtype)
-        none = jnp.zeros((), q.dtype)
-        rows[i] = KeptRows(rows[i], counted, none, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
+    first = layout(whole)[constraints].start
+    own = jnp.ones((first,), q.dtype) if whole.kept_rows is None else whole.kept_rows.kept[:first]
+    # Rows of weight zero are masked: q does not satisfy them, so that they have no derivative there.
+    counted = (aims.tolerances > 0)[holonomic_rows(layout(whole)) >= first].astype(q.dtype)
+    none = jnp.zeros((), q.dtype)
+    whole = whole.with_kept_rows(KeptRows(jnp.concatenate([own, counted]), none, none, none))
     # Places in q of the joints of one degree of freedom that have limits, or may have some.
     at, _ = screw_joints(model)
     if is_concrete(aims.lower, aims.upper):
@@ -246,10 +243,10 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
     def scene_at(active) -> Scene:
         """With the joints that are `active` held at their lower (-1) or upper (1) limits."""
         if not joints:
-            return Scene(model, tuple(rows))
+            return whole
         limit = jnp.where(active < 0, lower, upper)
         at_limit = jnp.where(active != 0, limit, jnp.zeros_like(limit))
-        return Scene(model, (*rows, _HeldAtLimits(active, at_limit, joints)))
+        return add_constraints(whole, [_HeldAtLimits(active, at_limit, joints)])
 
     def sides(below, above):
         return above.astype(q.dtype) - below.astype(q.dtype)
@@ -261,7 +258,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         place, _ = _with_derivatives(scene, q, q, jnp.ones((), q.dtype), t)
         return place, jnp.asarray(True)
 
-    fixed, guess, time = stop_gradient((Scene(model, tuple(rows)), posture, t))
+    fixed, guess, time = stop_gradient((whole, posture, t))
     bounds = None
     if joints:
         at_v = np.asarray([slot for place, slot in zip(*screw_joints(model), strict=True) if place in joints])
@@ -374,7 +371,7 @@ def follow(
         # A scan cannot raise: places that were not reached are reported after it, by their index.
         reached = inverse_kinematics(scene, at(row), guess, guesses=guesses, t=t, throw=False, **options)
         counted = independent_rows(scene, lax.stop_gradient(reached.q), t)
-        whole = Scene(scene.system, (*counted.constraints, *as_targets(scene.system, at(row))))
+        whole = add_constraints(counted, as_targets(scene.system, at(row)))
         return reached, unit_rows(whole, lax.stop_gradient(reached.q), t, factors)
 
     def go_on(carry, row):
