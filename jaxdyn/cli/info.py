@@ -11,8 +11,7 @@ import numpy as np
 from jaxdyn.cli.common import FILE, add_model_options, load_scene, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.branches import count_free
-from jaxdyn.constraints.selection import independent_rows, select_rows
+from jaxdyn.constraints.selection import count_free, independent_rows, select_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.formats import format_of
 from jaxdyn.io.xml_lines import XmlFile

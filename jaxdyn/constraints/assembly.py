@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import Evaluation, entry_point, evaluate, invalidate_derivatives, kernel
 from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
-from jaxdyn.constraints.branches import changes_branch, unit_rows
 from jaxdyn.constraints.closing import follow_path, nearest_configuration, polish
 from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
@@ -23,11 +22,13 @@ from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import CLOSED, LEAST_GAP, check_tolerance, clear_pivot, tolerance
 from jaxdyn.constraints.redundancy import (
     add_constraints,
+    changes_branch,
     coordinate_sizes,
     keep_rows,
     largest_ratio,
     opening_of_redundant,
     row_limits,
+    scaled_rows,
 )
 from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
 from jaxdyn.lie.so3 import matmul
@@ -89,7 +90,7 @@ class Assembly(Outcome):
         scene = as_scene(scene)
         held = {} if hold is None else {name: _first(value) for name, value in hold.items()}
         whole = add_constraints(scene, [lock_joint(*joint) for joint in held.items()])
-        R, inverse = jax.vmap(lambda q: unit_rows(whole, q, t))(self.q)
+        R, inverse = jax.vmap(lambda q: scaled_rows(whole, q, t))(self.q)
         changes = jax.vmap(partial(changes_branch, scene.system))(self.q[:-1], self.q[1:], R[1:], R[:-1], inverse[:-1])
         return jnp.concatenate([jnp.zeros(1, bool), changes])
 

@@ -1,4 +1,4 @@
-"""Scenes whose redundant rows are dropped: mask of rows, openings, multipliers; tolerances of residuals."""
+"""Scenes whose redundant rows are dropped: mask of rows, openings, multipliers; sizes of rows and residuals; branches."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import kernel
+from jaxdyn.compile import eliminate_rows, kernel, pseudo_inverse_by_rotations
 from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.base import (
     Constraint,
@@ -21,12 +21,13 @@ from jaxdyn.constraints.base import (
     rows,
     velocity_residual,
 )
-from jaxdyn.constraints.rank import REGULAR, eps_of, share
+from jaxdyn.constraints.rank import REGULAR, eps_of, share, tolerance
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displacement
 
 
 class KeptRows(eqx.Module):
@@ -101,6 +102,35 @@ def all_rows(scene: Scene) -> Scene:
 def rows_of(scene: Scene, dtype) -> Float[Array, " n"]:
     """The choice of rows as the vector that a step carries: 1 or 0 for each row, then `Selection.least`; a constant."""
     return lax.stop_gradient(jnp.append(scene.kept_rows.kept, scene.kept_rows.least)).astype(dtype)
+
+
+# A row below this part of the largest one of its constraint has no direction of its own: rounding is all that it holds.
+_TINY_ROW = 1e-3
+
+
+def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
+    """A for distances in units of the mechanism's length, each row scaled to length 1; rows of rounding alone stay small."""
+    # A row that vanishes at this configuration would become a unit row of noise, and count as independent.
+    sizes, _ = coordinate_sizes(scene.system, q.dtype)
+    A = constraint_jacobian(scene, q, t) * sizes[None]
+    squares = jnp.sum(A * A, 1)
+    largest = largest_of_each(scene, squares)
+    squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
+    # A constraint may have rows of zeros alone. By the reciprocal: products of known zeros are known, quotients are not.
+    return A * (1.0 / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny))))[:, None]
+
+
+def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
+    """Independent rows of B by Gram-Schmidt with pivots.
+
+    The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
+    others; a row is kept where its pivot is above `least`, and `most` rows at most.
+
+    **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of the others.
+    """
+    # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
+    kept, rest, pivots = eliminate_rows(B, first, least, min(B.shape) if most is None else most)
+    return kept, jnp.max(rest), jnp.min(jnp.where(kept > 0, pivots, jnp.inf))
 
 
 def largest_opening(scene: Scene, q, t, kept, v=None):
@@ -261,3 +291,69 @@ def largest_ratio(relative: float, scene: Scene, q, v, t):
     residuals = position_residual(scene, q, t), velocity_residual(scene, q, v, t)
     ratios = jax.tree.map(lambda x, limit: jnp.abs(x) / limit, residuals, limits)
     return jnp.max(jnp.concatenate(ratios), initial=0.0)
+
+
+JUMP = 1.0  # rad or lengths of the mechanism: a longer way between two configurations is no small step
+
+
+def scaled_rows(scene: Scene, q, t, factors=None):
+    """Rows of positions in coordinates scaled by their sizes, and their pseudo-inverse; constants.
+
+    `factors` (m,) are those of the last rows.
+    """
+    # Only decisions follow from these rows, so they are constants under differentiation.
+    scene, q = stop_gradient((scene, q))
+    sizes, _ = coordinate_sizes(scene.system, q.dtype)
+    R = constraint_jacobian(scene, q, t)[holonomic_rows(layout(scene))] * sizes[None]
+    if factors is not None:
+        count = R.shape[0] - factors.size
+        R = R * jnp.concatenate([jnp.ones((count,), q.dtype), lax.stop_gradient(factors)])[:, None]
+    return R, pseudo_inverse_by_rotations(R, tolerance(None, R))
+
+
+def changes_branch(system, before, after, R_after, R, inverse):
+    """Decide whether a combination of rows went through zero between two configurations, or a coordinate jumped.
+
+    `R` and `inverse` are those of `scaled_rows` at the first one, `R_after` those at the second.
+    """
+    sizes, _ = coordinate_sizes(system, before.dtype)
+    jump = jnp.max(jnp.abs(displacement(system, before, after)) / sizes, initial=0.0)
+    return passes_singular(R, inverse, R_after) | (jump > JUMP)
+
+
+def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
+    """-1 where the determinant is negative, else 1; a constant."""
+    return kernel(_sign, fallback=_sign_by_lapack)(None, lax.stop_gradient(A))
+
+
+def passes_singular(
+    A: Float[Array, "m n"], inverse: Float[Array, "n m"], after: Float[Array, "m n"]
+) -> Bool[Array, ""]:
+    """Decide whether a combination of rows goes through zero between A, with its pseudo-inverse, and the rows `after`.
+
+    det(A' A^+ + (1 - A A^+)) then changes its sign. The second term fills the null space of dependent rows, where the
+    determinant of the first one is zero.
+    """
+    own = jnp.eye(A.shape[0], dtype=A.dtype) - matmul(A, inverse)
+    return sign_of_determinant(matmul(after, inverse) + own) < 0
+
+
+def _sign(_, A):
+    """Sign by Gaussian elimination with row exchanges until the largest entry of a column is its pivot."""
+    # Kernels have no index that depends on data: the exchanges are selections between neighbours, as in a bubble sort.
+    sign = jnp.ones((), A.dtype)
+    rows = list(A)
+    for k in range(len(rows)):
+        for i in range(k + 1, len(rows)):
+            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+            rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
+            sign = jnp.where(swap, -sign, sign)
+        sign = jnp.where(rows[k][k] < 0, -sign, sign)
+        scale = 1 / jnp.where(rows[k][k] == 0, 1.0, rows[k][k])
+        for i in range(k + 1, len(rows)):
+            rows[i] = rows[i] - rows[i][k] * scale * rows[k]
+    return sign
+
+
+def _sign_by_lapack(_, A):
+    return jnp.where(jnp.linalg.slogdet(A)[0] < 0, -1.0, 1.0).astype(A.dtype)

@@ -21,11 +21,17 @@ from jaxdyn.compile import entry_point, invalidate_derivatives
 from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.assembly import check_search, closing_tolerance, independent_rows_near
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.branches import changes_branch, unit_rows
 from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.rank import condition_number, rank_of
-from jaxdyn.constraints.redundancy import KeptRows, add_constraints, has_selection, opening_of_redundant
+from jaxdyn.constraints.redundancy import (
+    KeptRows,
+    add_constraints,
+    changes_branch,
+    has_selection,
+    opening_of_redundant,
+    scaled_rows,
+)
 from jaxdyn.constraints.selection import independent_rows, most_rounding
 from jaxdyn.control.targets import (
     TASKS,
@@ -372,7 +378,7 @@ def follow(
         reached = inverse_kinematics(scene, at(row), guess, guesses=guesses, t=t, throw=False, **options)
         counted = independent_rows(scene, lax.stop_gradient(reached.q), t)
         whole = add_constraints(counted, as_targets(scene.system, at(row)))
-        return reached, unit_rows(whole, lax.stop_gradient(reached.q), t, factors)
+        return reached, scaled_rows(whole, lax.stop_gradient(reached.q), t, factors)
 
     def go_on(carry, row):
         q, R, inverse = carry

@@ -328,10 +328,13 @@ def frame_index(model: Any, name: str) -> int:
     check_name(name, "frame")
     # Files often name the joint where they mean its link, fixed joints included.
     carried = dict(model.fixed_joints) | dict(zip(model.topology.joint_names, model.topology.body_names, strict=True))
+    names = model.topology.frame_names
     try:
-        return model.topology.frame_names.index(name if name in model.topology.frame_names else carried.get(name, name))
+        return names.index(name if name in names else carried.get(name, name))
     except ValueError:
-        raise ValueError(f"frame {name!r} is not in model {model.name!r}; {_hint(name, model, carried)}") from None
+        near = difflib.get_close_matches(str(name), (*names, *carried), n=5, cutoff=0.4)
+        hint = f"did you mean {', '.join(near)}?" if near else f"frames are {', '.join(names[:10])} ..."
+        raise ValueError(f"frame {name!r} is not in model {model.name!r}; {hint}") from None
 
 
 def joint_index(model: Any, name: str) -> int:
@@ -370,10 +373,3 @@ def velocity_indices(model: Any, joints: Iterable[str]) -> np.ndarray:
     places = [model.topology.v_slices[joint_index(model, joint)] for joint in joints]
     # The empty array keeps the integer type when no joint is named.
     return np.concatenate([np.zeros(0, int), *(np.arange(place.start, place.stop) for place in places)])
-
-
-def _hint(name: str, model: Any, carried: dict) -> str:
-    near = difflib.get_close_matches(str(name), (*model.topology.frame_names, *carried), n=5, cutoff=0.4)
-    return (
-        f"did you mean {', '.join(near)}?" if near else f"frames are {', '.join(model.topology.frame_names[:10])} ..."
-    )
