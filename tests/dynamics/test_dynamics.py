@@ -4,7 +4,6 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import mujoco
 import numpy as np
 import pinocchio as pin
@@ -467,9 +466,8 @@ def test_derivatives_are_finite_at_rest_and_without_mass(kinds):
         assert np.isfinite(leaf).all()
 
 
-def test_refusals(monkeypatch):
-    # Annotations would refuse most of these before the function does.
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+@pytest.mark.usefixtures("as_users_have_it")  # annotations would refuse most of these before the function does
+def test_refusals():
     model = random_tree(1, ["revolute", "spherical"])
     q, v = jnp.asarray([0.0, 1, 0, 0, 0]), jnp.zeros(4)
     with pytest.raises(ValueError, match=r"q has shape \(4,\), expected \(5,\)"):
