@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import array_namespace, is_concrete
@@ -117,21 +118,12 @@ def disk_and_link(
     return as_scene(constrain_by_immersion(units, _tangent, 4, force=_Applied(torque, friction)))
 
 
-class _Toy(eqx.Module):
-    """Affine functions of the coordinates: gaps of the woodpecker, and rows of its sliding velocities."""
-
-    row: Float[Array, "3"]
-    constant: Float[Array, ""]
-
-    def __call__(self, q, t):
-        return jnp.sum(self.row.astype(q.dtype) * q) + self.constant.astype(q.dtype)
+def _toy_gap(row, constant, q, t):
+    return jnp.sum(row.astype(q.dtype) * q) + constant.astype(q.dtype)
 
 
-class _Row(eqx.Module):
-    row: Float[Array, "3"]
-
-    def __call__(self, q, t):
-        return self.row.astype(q.dtype)
+def _toy_row(row, q, t):
+    return row.astype(q.dtype)
 
 
 def _toy_metric(q, t, p):
@@ -195,8 +187,9 @@ def woodpecker(
     play, reach = sleeve_radius - pole_radius, to_spring + to_bird - beak[1]
 
     def contact(name, rate, constant, along, e):
-        gap = _Toy(as_leaf(rate), as_leaf(constant))
-        return gap_contact(gap, _Row(as_leaf(along)), friction, restitution=e, name=name)
+        # Affine functions of the coordinates: the gap, and the row of the sliding velocity.
+        gap, row = Partial(_toy_gap, as_leaf(rate), as_leaf(constant)), Partial(_toy_row, as_leaf(along))
+        return gap_contact(gap, row, friction, restitution=e, name=name)
 
     # Sliding velocity of an edge: that of the sleeve's centre and of its turn at the radius.
     edge = (1.0, sleeve_radius, 0.0)

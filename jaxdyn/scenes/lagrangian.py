@@ -1,9 +1,9 @@
 """Elementary systems: particles, pendulums, arms, a body that turns freely, a box, a sliding block."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.tree_util import Partial
+from jaxtyping import Array
 
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Holonomic
@@ -95,14 +95,10 @@ def spherical_pendulum_in_angles(*, mass: Number = 1.0, length: Number = 1.0, gr
     return Scene(LagrangianSystem(_sphere, 2, parameters=parameters, potential=_sphere_potential))
 
 
-class _Rod(eqx.Module):
+def _rod(length, q, t):
     """Constraint (|q|^2 - length^2) / 2, so that A = q^T and the tension is -lam length."""
-
-    length: Float[Array, ""] = eqx.field(converter=as_leaf)
-
-    def __call__(self, q, t):
-        # Squares instead of |q| - l: the rows stay defined at q = 0, where |q| has no derivative.
-        return 0.5 * (jnp.sum(q * q) - self.length.astype(q.dtype) ** 2)
+    # Squares instead of |q| - l: the rows stay defined at q = 0, where |q| has no derivative.
+    return 0.5 * (jnp.sum(q * q) - length.astype(q.dtype) ** 2)
 
 
 def _particle(q, v, t, p):
@@ -111,7 +107,7 @@ def _particle(q, v, t, p):
 
 def _on_rod(dimension: int, mass, length, gravity) -> Scene:
     system = LagrangianSystem(_particle, dimension, parameters={"mass": mass, "gravity": gravity})
-    return Scene(system, (Holonomic(_Rod(length), name="rod"),))
+    return Scene(system, (Holonomic(Partial(_rod, as_leaf(length)), name="rod"),))
 
 
 def _plane_start(length: Number = 1.0, angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:

@@ -1,10 +1,10 @@
 """Nonholonomic systems: rolling disks and balls, blades, Suslov's body, and hands whose fingertips roll on the object."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.tree_util import Partial
+from jaxtyping import Array
 
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Holonomic, Pfaffian, knife_edge, rolling_sphere, rolling_wheel
@@ -31,20 +31,12 @@ from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 
 
-class _DiskRows(eqx.Module):
+def _disk_rows(radius, q, t):
     """Rolling without slip: xdot = rho cos(theta) phidot, ydot = rho sin(theta) phidot."""
-
-    radius: Float[Array, ""] = eqx.field(converter=as_leaf)
-
-    def __call__(self, q, t):
-        rho = self.radius.astype(q.dtype)
-        zero, one = jnp.zeros_like(q[0]), jnp.ones_like(q[0])
-        return jnp.stack(
-            [
-                jnp.stack([one, zero, zero, -rho * jnp.cos(q[2])]),
-                jnp.stack([zero, one, zero, -rho * jnp.sin(q[2])]),
-            ]
-        )
+    rho = radius.astype(q.dtype)
+    zero, one = jnp.zeros_like(q[0]), jnp.ones_like(q[0])
+    along = jnp.stack([one, zero, zero, -rho * jnp.cos(q[2])])
+    return jnp.stack([along, jnp.stack([zero, one, zero, -rho * jnp.sin(q[2])])])
 
 
 def _disk(q, v, t, p):
@@ -74,7 +66,10 @@ def rolling_disk(
     Source: Murray, Li & Sastry (1994), section 6.1.1; EQUATIONS section 6 and erratum E30.
     """
     parameters = {"mass": mass, "steer": steer_inertia, "roll": roll_inertia}
-    return Scene(LagrangianSystem(_disk, 4, parameters=parameters), (Pfaffian(_DiskRows(radius), name="rolling"),))
+    return Scene(
+        LagrangianSystem(_disk, 4, parameters=parameters),
+        (Pfaffian(Partial(_disk_rows, as_leaf(radius)), name="rolling"),),
+    )
 
 
 def _sleigh_start(speed: Number = 0.2, yaw_rate: Number = 1.5) -> tuple[Array, Array]:
@@ -149,12 +144,9 @@ def rolling_coin(*, mass: Number = 0.3048, radius: Number = 0.05, gravity: Numbe
     return Scene(builder.build(), (rolling_wheel("coin", axle, radius, name="rim"),))
 
 
-class _NoTurn(eqx.Module):
-    """Constraint of zero third angular velocity."""
-
-    def __call__(self, q, t):
-        # The velocity of a spherical joint is in the body's axes, so the row is constant.
-        return jnp.asarray([0.0, 0.0, 1.0], q.dtype)
+def _third_velocity(q, t):
+    # The velocity of a spherical joint is in the body's axes, so the row is constant.
+    return jnp.asarray([0.0, 0.0, 1.0], q.dtype)
 
 
 def _suslov_start(across: Number = 1.0, along: Number = -0.5) -> tuple[Array, Array]:
@@ -176,7 +168,7 @@ def suslov(*, moments: Row = (1.0, 1.5, 2.0), product: Number = 0.4) -> Scene:
     tensor = [[xx, 0.0, product], [0.0, yy, 0.0], [product, 0.0, zz]]
     builder = ModelBuilder("Suslov body", gravity=None)
     builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), tensor))
-    return Scene(builder.build(), (Pfaffian(_NoTurn(), name="no turn about z"),))
+    return Scene(builder.build(), (Pfaffian(_third_velocity, name="no turn about z"),))
 
 
 _EGG_SEMI_AXES = (0.1, 0.09, 0.11)  # m
@@ -286,14 +278,10 @@ def hand_rolling_egg(
     return Grasp(system, "egg", list(system.rows), cones=cones_of(mu))
 
 
-class _Steady(eqx.Module):
+def _steady(rate, q, t):
     """Rheonomic constraint: first coordinate minus rate times t, a table driven at a constant rate."""
-
-    rate: Float[Array, ""] = eqx.field(converter=as_leaf)
-
-    def __call__(self, q, t):
-        # The cast keeps a float32 scene in float32, whatever the dtype of the leaf.
-        return q[0] - self.rate.astype(q.dtype) * t
+    # The cast keeps a float32 scene in float32, whatever the dtype of the leaf.
+    return q[0] - rate.astype(q.dtype) * t
 
 
 def _turntable_start(
@@ -319,7 +307,7 @@ def ball_on_turntable(*, mass: Number = 1.0, radius: Number = 0.2, rate: Number 
     builder.add_body("table", None, "continuous", (1.0, (0.0, 0.0, 0.0), (0.5, 0.5, 1.0)), joint_name="1")
     builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="2")
     rolling = rolling_sphere("ball", None, radius, surface_body="table", name="contact")
-    return Scene(builder.build(), (Holonomic(_Steady(rate), name="drive"), rolling))
+    return Scene(builder.build(), (Holonomic(Partial(_steady, as_leaf(rate)), name="drive"), rolling))
 
 
 def _ball_on_incline_start(radius: Number = 0.1, velocity: Row = (0.0, 0.5)) -> tuple[Array, Array]:
