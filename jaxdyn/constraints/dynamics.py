@@ -124,7 +124,10 @@ def constrained_dynamics(
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     places = layout(scene)
     if not places:
-        return _free_dynamics(scene, q, v, total_force(scene, q, v, tau, t), t)
+        metric = mass_factor(mass_matrix(scene.system, q, t))
+        a = metric.solve(total_force(scene, q, v, tau, t) - bias_force(scene.system, q, v, t))
+        result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)
+        return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), require_finite(result, a), ())
     state = q, v, tau, t
     scene = independent_rows(scene, q, t, rank_tol)
     if method != "rank_aware":
@@ -204,13 +207,6 @@ def total_force(scene: Scene, q, v, tau, t) -> Array:
     tau = jnp.zeros_like(v) if tau is None else check_force(tau, q, scene.nv, "tau")
     force = scene.applied_force(q, v, t)
     return tau if force is None else tau + force
-
-
-def _free_dynamics(scene, q, v, force, t) -> ConstrainedDynamics:
-    metric = mass_factor(mass_matrix(scene.system, q, t))
-    a = metric.solve(force - bias_force(scene.system, q, v, t))
-    result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)
-    return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), require_finite(result, a), ())
 
 
 def solve_rows(scene: Scene, q, v, force, t, row: Rows) -> ConstrainedDynamics:
