@@ -28,7 +28,7 @@ from jaxdyn.constraints.redundancy import (
     largest_ratio,
     opening_of_redundant,
     row_limits,
-    scaled_rows,
+    unit_size_rows,
 )
 from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
 from jaxdyn.lie.so3 import matmul
@@ -90,7 +90,7 @@ class Assembly(Outcome):
         scene = as_scene(scene)
         held = {} if hold is None else {name: _first(value) for name, value in hold.items()}
         whole = add_constraints(scene, [lock_joint(*joint) for joint in held.items()])
-        R, inverse = jax.vmap(lambda q: scaled_rows(whole, q, t))(self.q)
+        R, inverse = jax.vmap(lambda q: unit_size_rows(whole, q, t))(self.q)
         changes = jax.vmap(partial(changes_branch, scene.system))(self.q[:-1], self.q[1:], R[1:], R[:-1], inverse[:-1])
         return jnp.concatenate([jnp.zeros(1, bool), changes])
 

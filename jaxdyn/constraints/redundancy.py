@@ -296,7 +296,7 @@ def largest_ratio(relative: float, scene: Scene, q, v, t):
 JUMP = 1.0  # rad or lengths of the mechanism: a longer way between two configurations is no small step
 
 
-def scaled_rows(scene: Scene, q, t, factors=None):
+def unit_size_rows(scene: Scene, q, t, factors=None):
     """Rows of positions in coordinates scaled by their sizes, and their pseudo-inverse; constants.
 
     `factors` (m,) are those of the last rows.
@@ -314,7 +314,7 @@ def scaled_rows(scene: Scene, q, t, factors=None):
 def changes_branch(system, before, after, R_after, R, inverse):
     """Decide whether a combination of rows went through zero between two configurations, or a coordinate jumped.
 
-    `R` and `inverse` are those of `scaled_rows` at the first one, `R_after` those at the second.
+    `R` and `inverse` are those of `unit_size_rows` at the first one, `R_after` those at the second.
     """
     sizes, _ = coordinate_sizes(system, before.dtype)
     jump = jnp.max(jnp.abs(displacement(system, before, after)) / sizes, initial=0.0)

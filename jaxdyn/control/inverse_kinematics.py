@@ -30,7 +30,7 @@ from jaxdyn.constraints.redundancy import (
     changes_branch,
     has_selection,
     opening_of_redundant,
-    scaled_rows,
+    unit_size_rows,
 )
 from jaxdyn.constraints.selection import independent_rows, most_rounding
 from jaxdyn.control.targets import (
@@ -378,7 +378,7 @@ def follow(
         reached = inverse_kinematics(scene, at(row), guess, guesses=guesses, t=t, throw=False, **options)
         counted = independent_rows(scene, lax.stop_gradient(reached.q), t)
         whole = add_constraints(counted, as_targets(scene.system, at(row)))
-        return reached, scaled_rows(whole, lax.stop_gradient(reached.q), t, factors)
+        return reached, unit_size_rows(whole, lax.stop_gradient(reached.q), t, factors)
 
     def go_on(carry, row):
         q, R, inverse = carry

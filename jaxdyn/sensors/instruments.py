@@ -171,7 +171,21 @@ def _as_frames(frames: Any) -> tuple[str, ...] | None:
     return None if frames is None else check_names(frames, "frames")
 
 
-class Encoder(Sensor):
+class _OnJoint(Sensor):
+    """A sensor of a joint: `joint` its name, `name` by default KIND of JOINT; `noise`, `delay` (s) as of `Sensor`."""
+
+    joint: str = eqx.field(static=True)
+
+    def default_name(self) -> str:
+        """Name "KIND of JOINT"."""
+        return f"{type(self).__name__.lower()} of {self.joint}"
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a joint that the model does not have. **Raises:** ValueError."""
+        joint_index(scene.system, self.joint)
+
+
+class Encoder(_OnJoint):
     """Coordinates of a joint in steps of a resolution, (nq of the joint,), rad or m.
 
     **Arguments:** `joint`, a name; `resolution`, rad or m, of one count: readings are rounded down to a multiple of it (None: not
@@ -185,13 +199,8 @@ class Encoder(Sensor):
     ```
     """
 
-    joint: str = eqx.field(static=True)
     # A leaf, and not static: another resolution does not cause a second compilation.
     resolution: Array | None = eqx.field(converter=_as_resolution, default=None, kw_only=True)
-
-    def default_name(self) -> str:
-        """Name "encoder of JOINT"."""
-        return f"encoder of {self.joint}"
 
     def check(self, scene: Scene) -> None:
         """Refuse a joint that the model does not have. **Raises:** ValueError."""
@@ -220,21 +229,11 @@ class Encoder(Sensor):
         return readings + lax.stop_gradient(step * jnp.floor(readings / step) - readings)
 
 
-class Tachometer(Sensor):
+class Tachometer(_OnJoint):
     """Velocities of a joint, (nv of the joint,), rad/s or m/s.
 
     **Arguments:** `joint`, a name; `name`, `noise`, `delay` (s) as of `Sensor`.
     """
-
-    joint: str = eqx.field(static=True)
-
-    def default_name(self) -> str:
-        """Name "tachometer of JOINT"."""
-        return f"tachometer of {self.joint}"
-
-    def check(self, scene: Scene) -> None:
-        """Refuse a joint that the model does not have. **Raises:** ValueError."""
-        joint_index(scene.system, self.joint)
 
     def read(self, motion: Motion) -> Float[Array, " n"]:
         """Velocities of the joint."""
@@ -386,7 +385,7 @@ class ContactForce(Sensor):
         return motion.multipliers[constraint_place(motion.scene, self.constraint)]
 
 
-class Touch(Sensor):
+class Touch(_OnFrame):
     """Sum of the normal forces of unilateral contacts, (1,), N: a switch or a load cell under a foot.
 
     **Arguments:** `frame`, the name of a body or frame: all contacts on its body count that are between bodies, as those of
@@ -399,12 +398,6 @@ class Touch(Sensor):
     sensor = jd.sensors.Touch("FL_foot")
     ```
     """
-
-    frame: str = eqx.field(static=True)
-
-    def default_name(self) -> str:
-        """Name "touch of FRAME"."""
-        return f"touch of {self.frame}"
 
     def check(self, scene: Scene) -> None:
         """Refuse a frame without contacts. **Raises:** ValueError."""
