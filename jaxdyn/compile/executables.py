@@ -15,9 +15,9 @@ import jax
 import numpy as np
 
 from jaxdyn.compile import disk, jax_adapter, mode, stored
-from jaxdyn.compile.first_calls import phase
 from jaxdyn.compile.jax_adapter import select_options
 from jaxdyn.compile.known import is_concrete, is_tracing
+from jaxdyn.compile.mode import phase
 from jaxdyn.compile.primitive import target
 
 # What a stored executable may call: kernels, which are restored with it, and functions that every jaxlib has. A call of

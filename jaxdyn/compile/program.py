@@ -268,3 +268,12 @@ def as_objects(x) -> np.ndarray:
 
 
 _OF_PYTHON = (np.dtype(np.float64), np.dtype(bool))
+
+
+def split_by_counts(values: Sequence, counts: Sequence[int]) -> tuple:
+    """Consecutive parts of these lengths."""
+    at, parts = 0, []
+    for count in counts:
+        parts.append(tuple(values[at : at + count]))
+        at += count
+    return tuple(parts)

@@ -19,7 +19,7 @@ from jax import lax
 from kernel_helpers import native, quick, refuse
 
 from jaxdyn import compile as backend
-from jaxdyn.compile import derive, disk, evaluate, kernels, known, mode, objects, operations, target, trace
+from jaxdyn.compile import derive, disk, evaluate, kernels, known, mode, operations, stored, target, trace
 from jaxdyn.compile.code import kernel_ir
 from jaxdyn.compile.expansion import NotNumbers, expand
 from jaxdyn.compile.operations import as_operations
@@ -675,9 +675,9 @@ def test_results_do_not_depend_on_the_level_of_the_compiler(width, monkeypatch):
     assert "fmuladd" in text
     results = []
     for level in (0, 1):
-        monkeypatch.setattr(objects, "_level", lambda level=level: level)
-        monkeypatch.setattr(objects, "wanted_options", lambda level=level: "" if level else "least")
-        code, rows = objects.Code(objects.compile_text(text)), [np.empty((9, 4)), np.empty((9, 4))]
+        monkeypatch.setattr(stored, "_level", lambda level=level: level)
+        monkeypatch.setattr(stored, "wanted_options", lambda level=level: "" if level else "least")
+        code, rows = stored.Code(stored.compile_text(text)), [np.empty((9, 4)), np.empty((9, 4))]
         data = (ctypes.c_void_p * 4)(*(y.ctypes.data for y in (A, x, *rows)))
         ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * 3)(code.address("kernel"))(data, 9, 0, 9)
         results.append(rows)
@@ -946,9 +946,9 @@ def code_of(number: float):
     import ctypes
 
     text = IR.replace("CONSTANT", f"{number:.6e}")
-    made = objects.code_of(text)
+    made = stored.code_of(text)
     return (
-        objects.name_of_file(hashlib.sha256(text.encode()).hexdigest()),
+        stored.name_of_file(hashlib.sha256(text.encode()).hexdigest()),
         made,
         ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f")),
     )
@@ -957,8 +957,8 @@ def code_of(number: float):
 def built(monkeypatch):
     """A list that grows when LLVM compiles."""
     seen = []
-    compiled = objects.compile_text
-    monkeypatch.setattr(objects, "compile_text", lambda *args: seen.append(args) or compiled(*args))
+    compiled = stored.compile_text
+    monkeypatch.setattr(stored, "compile_text", lambda *args: seen.append(args) or compiled(*args))
     return seen
 
 
@@ -981,11 +981,11 @@ def test_files_are_written_found_and_checked(folder, monkeypatch, caplog):
 
 
 def test_another_processor_or_version_has_other_files(monkeypatch):
-    before = objects.name_of_file("a program")
-    assert objects.name_of_file("another program") != before
-    monkeypatch.setattr(objects, "features", lambda: "+other")
-    monkeypatch.setattr(objects, "_environment", objects._environment.__wrapped__)
-    assert objects.name_of_file("a program") != before
+    before = stored.name_of_file("a program")
+    assert stored.name_of_file("another program") != before
+    monkeypatch.setattr(stored, "features", lambda: "+other")
+    monkeypatch.setattr(stored, "_environment_of_code", stored._environment_of_code.__wrapped__)
+    assert stored.name_of_file("a program") != before
 
 
 def test_old_files_are_removed(folder, monkeypatch):
@@ -1011,7 +1011,7 @@ def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
     def function(x):
         return jnp.sin(x) * 7.654321
 
-    for place, name in ((objects, "compile_text"), (target, "kernel_ir"), (trace, "expand")):
+    for place, name in ((stored, "compile_text"), (target, "kernel_ir"), (trace, "expand")):
         with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt, jax.errors.JaxRuntimeError):
             patched.setattr(place, name, interrupted)
             jax.jit(native(lambda x: function(x)))(jnp.ones(3))
