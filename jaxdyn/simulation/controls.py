@@ -282,7 +282,7 @@ def state_of(control: Any, y, q, v, t) -> Any:
 
 
 def at_start(control: Control, q, v, t) -> Any:
-    """Control as a function (q, v, t) -> tau for a linearisation at this state (`find_stiffness`).
+    """Control as a function (q, v, t) -> tau for a linearisation at this state (`stiff_rates`).
 
     The state of a controller is held at the value with which a run from here would start. None where tau is no function of
     (q, v, t): for a sampled law, and for a law that uses the multipliers.

@@ -20,15 +20,7 @@ from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype, w
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
-from jaxdyn.simulation.events import (
-    Event,
-    Watch,
-    check_events,
-    check_terminals,
-    events_of,
-    report_limits,
-    sort_events,
-)
+from jaxdyn.simulation.events import Event, Watch, check_events, check_terminals, events_of, report_limits, sort_events
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
 from jaxdyn.simulation.options import (
     ADJOINTS,
@@ -221,7 +213,7 @@ def smooth_motion(*args) -> Solution:
 @entry_point
 def hybrid_motion(*args) -> Solution:
     """A run with modes."""
-    from jaxdyn.simulation.hybrid.motion import hybrid_motion
+    from jaxdyn.simulation.hybrid import hybrid_motion
 
     return hybrid_motion(*args)
 
@@ -276,10 +268,13 @@ def _solver_at_start(scene: Scene, control, solver, stepsize, adjoint, arrays, m
     # Only for adaptive steps without modes: events are located within explicit steps. Backwards the equations are others.
     if solver is not None or not scene.forces or modal or is_step_length(stepsize) or is_backsolve(adjoint):
         return solver
-    from jaxdyn.simulation.solvers.choice import solver_for_start
+    from jaxdyn.simulation.solvers.choice import Rodas5P, stiff_rates
 
     q0, v0, ts, *_ = arrays
-    return solver_for_start(scene, controls.at_start(control, q0, v0, ts[0]), q0, v0, ts)
+    law = controls.at_start(control, q0, v0, ts[0])
+    if not is_known(scene, law, q0, v0, ts) or stiff_rates(scene, q0, v0, ts[0], law, float(ts[-1] - ts[0])) is None:
+        return None
+    return Rodas5P()
 
 
 @once

@@ -217,24 +217,21 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     )
 
 
-def _is_explicit(solver) -> bool:
-    import diffrax
-
-    from jaxdyn.simulation.solvers.choice import innermost
-
-    return solver is None or isinstance(innermost(solver), diffrax.AbstractERK)  # those by default are explicit
-
-
 def _advice(name: str, solution: Solution, scene: Scene, control, options) -> str:
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options._asdict())
     # The scene may have become stiff on the way, so that the choice of the solver at the start has not seen it.
-    if name == "max_steps_reached" and _is_explicit(options.solver):
-        from jaxdyn.simulation.solvers.choice import find_stiffness, is_stiff
+    if name == "max_steps_reached":
+        import diffrax
+
+        from jaxdyn.simulation.solvers.choice import innermost, stiff_rates
 
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
         state = solution.q[last], solution.v[last], solution.ts[last]
-        rates = find_stiffness(scene, *state, at_start(control, *state))
-        if rates is not None and is_stiff(rates, float(solution.ts[-1]) - float(solution.ts[0])):
+        span = float(solution.ts[-1]) - float(solution.ts[0])
+        # Solvers by default are explicit.
+        is_explicit = options.solver is None or isinstance(innermost(options.solver), diffrax.AbstractERK)
+        rates = stiff_rates(scene, *state, at_start(control, *state), span) if is_explicit else None
+        if rates is not None:
             advice = (
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
                 f"{float(rates.explicit_step):.3g} s; pass solver=jd.solvers.Rodas5P(), or "

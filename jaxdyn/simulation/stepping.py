@@ -19,12 +19,11 @@ from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.contact_problem import contacts_of
 from jaxdyn.simulation.contact_steps import ContactStep, contact_step, mean_of_steps
 from jaxdyn.simulation.equations import DRIVES
-from jaxdyn.simulation.hybrid.motion import PiecewiseSystem, piecewise_motion
+from jaxdyn.simulation.hybrid import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import may_have_redundant_rows
 from jaxdyn.simulation.solvers import LibrarySteps
 from jaxdyn.simulation.solvers.diffrax_methods import RK4
-from jaxdyn.simulation.solvers.driver import step_control
-from jaxdyn.simulation.solvers.integrator import LibraryRun
+from jaxdyn.simulation.solvers.driver import LibraryRun, step_control
 from jaxdyn.simulation.solvers.steps import take_step
 from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike

@@ -19,7 +19,7 @@ from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import integrate, neutral
-from jaxdyn.simulation import Pose, integration
+from jaxdyn.simulation import Pose, motion
 from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS
@@ -119,7 +119,7 @@ def test_only_models_with_quaternions_are_retracted(pendulum, leg, monkeypatch):
         wrapped.extend([] if project is None else [project])
         return LibrarySteps(solver, project, *more, **fields)
 
-    monkeypatch.setattr(integration, "LibrarySteps", made)
+    monkeypatch.setattr(motion, "LibrarySteps", made)
     for model, size in ((pendulum, 0), (leg, 1)):
         q0, v0 = neutral(model), jnp.zeros(model.nv)
         jax.make_jaxpr(lambda q, v, model=model: simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)

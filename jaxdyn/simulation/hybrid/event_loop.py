@@ -32,9 +32,8 @@ from jaxdyn.simulation.hybrid.reactions import Collision
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
 from jaxdyn.simulation.solvers import driver
-from jaxdyn.simulation.solvers.driver import step_control
+from jaxdyn.simulation.solvers.driver import Integrator, LibraryRun, step_control, zeros_or
 from jaxdyn.simulation.solvers.guards import delay
-from jaxdyn.simulation.solvers.integrator import Integrator, LibraryRun, zeros_or
 from jaxdyn.simulation.solvers.steps import Plan
 
 
