@@ -111,7 +111,8 @@ def fit_gains(
 
     **Returns:** `DriveGains`.
 
-    **Raises:** ValueError when logs and model do not fit together, for an unknown body, and where the payload identifies no gain.
+    **Raises:** ValueError when logs and model do not fit together, for an unknown body, for fewer
+    samples than unknowns of a joint, and where the payload identifies no gain.
 
     Source: Gautier & Briot (2014), "Global identification of joint drive gains and dynamic parameters of robots", ASME Journal of
     Dynamic Systems, Measurement, and Control 136; errors here are those of the currents, which least squares over both allows.
@@ -211,6 +212,11 @@ def _fit(problem: _Problem, v_s: float):
     """Score, error in per cent, gains, standard deviations, factor of an interval, v_s, and the result."""
     data, nv = problem.data, problem.nv
     triangles, samples = data.merge(), int(data.samples.sum())
+    # A joint whose rows are fitted exactly shows no error, and its weight, one over it, would decide everything.
+    if samples <= (unknowns := 1 + max(map(len, problem.unknowns))):
+        raise ValueError(
+            f"the logs have {samples} samples, too few for the {unknowns} unknowns of a joint and its gain; log more samples"
+        )
     sizes = np.array([max(float(np.linalg.norm(R[:, -1])), 1e-300) for R in triangles])
     start = _start(problem, triangles)
     state = _State(np.zeros(problem.size), start, 1 / sizes)

@@ -16,7 +16,7 @@ from jaxdyn.identify.logs import (
     are_angles,
     idle_coordinates,
     log_rate,
-    pad_length,
+    low_pass,
     root_mean_square,
     travel_ranges,
 )
@@ -74,8 +74,6 @@ def from_raw(
 
     Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
     """
-    from scipy.signal import butter, filtfilt
-
     for name, value, least in (("order", order, 1), ("trim", trim, 0), ("every", every, 1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}")
@@ -108,14 +106,12 @@ def from_raw(
             f"period of cutoff={cutoff} Hz; cut the log there or lower the cut-off"
         )
     grid = np.linspace(t[0], t[-1], n)
-    # scipy's annotations leave open what `output` gives.
-    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
 
     def uniform(x):
         return np.stack([np.interp(grid, t, column) for column in x.T], axis=1)
 
     def low(x):
-        return filtfilt(numerator, denominator, x, axis=0, padlen=pad_length(rate, cutoff, n))
+        return low_pass(x, rate, cutoff, order)
 
     q, tau = spline_lines(t, q, "positions"), spline_lines(t, tau, "torques")
     positions, torques = low(uniform(q)), low(uniform(tau))
