@@ -247,18 +247,13 @@ def torque(control: Control, scene: Scene, y, q, v, t, multipliers: Callable) ->
     def torque_of(lam):
         return check_force(control(q, v, t, state, lam), q, scene.nv, "control")
 
+    # lam = f(lam) for an affine f: f(lam) = f(0) + F lam, so (1 - F) lam = f(0). Redundant rows can make 1 - F singular. Any
+    # solution will do, and the pseudo-inverse chooses the shortest.
     zero = jnp.zeros((_row_count(scene),), q.dtype)
-    return torque_of(_solve_affine_loop(lambda lam: multipliers(torque_of(lam)), zero))
-
-
-def _solve_affine_loop(function: Callable, zero: Float[Array, " nc"]) -> Float[Array, " nc"]:
-    """Solution of lam = f(lam) for an affine function f; `zero` is its argument at the origin."""
-    # f(lam) = f(0) + F lam, so (1 - F) lam = f(0). Redundant rows can make 1 - F singular. Any solution will do, and
-    # the pseudo-inverse chooses the shortest.
-    at_zero, apply_F = jax.linearize(function, zero)
+    at_zero, apply_F = jax.linearize(lambda lam: multipliers(torque_of(lam)), zero)
     identity = jnp.eye(zero.shape[0], dtype=zero.dtype)
     matrix = identity - jax.vmap(apply_F, out_axes=1)(identity)
-    return matmul(pseudo_inverse(matrix, tolerance(None, matrix)), at_zero)
+    return torque_of(matmul(pseudo_inverse(matrix, tolerance(None, matrix)), at_zero))
 
 
 def rates(control: Any, y, q, v, t, multipliers: Callable) -> dict[str, Array]:

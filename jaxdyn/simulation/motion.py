@@ -181,7 +181,12 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
     conditions = Conditions(at_contacts, at_limits, controls.can_end(control, *start), len(options.terminals))
     for one in options.terminals:
         check_callback(one.function, "Terminal: function", "function(q, v, t)", *start)
-    _check_conditions(conditions, options.adjoint)
+    if any(conditions) and is_backsolve(options.adjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which does not go back through events, and contacts, limits, a terminal event or the "
+            "control may end the run; take 'reverse', or jd.events.ContactLost(stop=False), no other events and a control "
+            "without `allowance`"
+        )
     eqs, args = equations(scene, control, method, entries, *start, conditions, options.terminals)
     # Shapes that do not fit are reported here, with the user's function at the end of the traceback.
     eqx.filter_eval_shape(eqs.generalized_force, args, entries, *start)
@@ -190,16 +195,6 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
         y0 = y0 | {KEPT: rows_of(scene, start[0].dtype)}
     y0 = y0 | {"work": jnp.zeros((), start[0].dtype)} if "work" in options.outputs else y0
     return _Run(scene, control, method, eqs, args), y0
-
-
-def _check_conditions(conditions: Conditions, adjoint) -> None:
-    """Refuse an adjoint that does not go back through the event that may end a run."""
-    if any(conditions) and is_backsolve(adjoint):
-        raise ValueError(
-            "adjoint is 'backsolve', which does not go back through events, and contacts, limits, a terminal event or the "
-            "control may end the run; take 'reverse', or jd.events.ContactLost(stop=False), no other events and a control "
-            "without `allowance`"
-        )
 
 
 def _solver(run: _Run, y0, solver):

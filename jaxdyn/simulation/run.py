@@ -181,7 +181,9 @@ def simulate(
         terminals=terminals,
         max_steps=step_limit(max_steps, start[-1], stepsize, options.adjoint),
         limit_is_given=max_steps is not None,
-        selects_rows=not concrete and _selects_rows(scene, method, *start),
+        # Because the start is traced, the independent rows have to be selected during the run.
+        selects_rows=not (concrete or not scene.constraints or is_concrete((scene, method, start)))
+        and (method.rank_tol is not None or may_have_redundant_rows(scene)),
     )
     dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
     # Known numbers go to the compiled program as they are: each array of JAX made before would be a transfer of its own.
@@ -223,19 +225,15 @@ def _check_numbers(scene: Scene, q0, v0, ts, rtol, atol, stepsize) -> tuple:
     q0, v0, ts = as_array(q0, "q0"), as_array(v0, "v0"), as_array(ts, "ts")
     checks.check_start(scene, as_numpy_if_known(q0), as_numpy_if_known(v0))
     checks.check_times(as_numpy_if_known(ts))
-    rtol, atol = (_tolerance(name, value) for name, value in (("rtol", rtol), ("atol", atol)))
-    return (q0, v0, ts, rtol, atol), as_array(stepsize, "stepsize") if is_step_length(stepsize) else stepsize
+    tolerances = []
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        tolerances.append(_DEFAULT_TOLERANCE if value is None else as_array(value, name))
+        if value is not None:
+            check_tolerance(name, tolerances[-1])
+    return (q0, v0, ts, *tolerances), as_array(stepsize, "stepsize") if is_step_length(stepsize) else stepsize
 
 
 _DEFAULT_TOLERANCE = np.asarray(1e-8)
-
-
-def _tolerance(name: str, value):
-    if value is None:
-        return _DEFAULT_TOLERANCE
-    value = as_array(value, name)
-    check_tolerance(name, value)
-    return value
 
 
 def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool, concrete: bool) -> tuple[Scene, Method]:
@@ -310,10 +308,3 @@ def _choose(
     stops = at_contacts, watch.limits is not None and watch.limits.stop
     checks_mass, shows_progress = may_have_singular_mass(scene.system), watch.progress is not None
     return Options(solver, adjoint, outputs, stops, watch.max_events, shows_progress, checks_mass)
-
-
-def _selects_rows(scene: Scene, method: Method, q0, v0, ts) -> bool:
-    """True if the independent rows have to be selected during the run, because the start is traced."""
-    if not scene.constraints or is_concrete((scene, method, q0, v0, ts)):
-        return False
-    return method.rank_tol is not None or may_have_redundant_rows(scene)

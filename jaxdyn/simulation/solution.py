@@ -279,7 +279,7 @@ def signals_as_given(solution: Solution, scene: SceneLike) -> list[Signal]:
             f"{scene.nv}; pass the scene that was simulated"
         )
     names = columns_of(scene.system)
-    rows = _row_names(scene)
+    rows = tuple(f"{x.name}.{k - x.start + 1}" for x in layout(scene) for k in range(x.start, x.end))
     both = ("position", "velocity")
     columns = [
         ("q", solution.q, names.q, names.q_units),
@@ -297,12 +297,6 @@ def signals_as_given(solution: Solution, scene: SceneLike) -> list[Signal]:
         columns.append((f"contact_force_{name}", values, parts, ("",) * len(parts)))
     columns += [(f"contact_margin_{name}", values, (), ("",)) for name, values in solution.contact_margins.items()]
     return [Signal(key, x, tuple(n), tuple(u)) for key, x, n, u in columns if x is not None]
-
-
-def _row_names(scene: Scene) -> tuple[str, ...]:
-    return tuple(
-        f"{place.name}.{k - place.start + 1}" for place in layout(scene) for k in range(place.start, place.end)
-    )
 
 
 def times(solution: Solution) -> np.ndarray:

@@ -131,13 +131,16 @@ def extend(scene: Scene) -> Scene:
     return Scene(
         scene.system,
         # Behind the scene's own rows, whose indices stay as they are: outputs take the first `own` multipliers.
-        (*scene.constraints, *(_constraint(force) for force in scene.forces if isinstance(force, WithModes))),
+        (
+            *scene.constraints,
+            *(
+                x.contact if isinstance(x, UnilateralContact) else x.along
+                for x in scene.forces
+                if isinstance(x, WithModes)
+            ),
+        ),
         tuple(force for force in scene.forces if not isinstance(force, WithModes)),
     )
-
-
-def _constraint(force: Any):
-    return force.contact if isinstance(force, UnilateralContact) else force.along
 
 
 def elements_of(scene: Scene, pieces: Pieces) -> Elements:
