@@ -12,16 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from jaxdyn.compile import careful
-from jaxdyn.compile.body import (
-    Body,
-    allocation,
-    bytes_of,
-    copy_bytes,
-    fill_zeros,
-    has_zeros,
-    is_zero,
-    write_call,
-)
+from jaxdyn.compile.body import Body, allocation, bytes_of, copy_bytes, fill_zeros, has_zeros, is_zero, write_call
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import COMPARISONS, Array, Constant, Program, dtype_of, kind_of

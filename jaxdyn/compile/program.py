@@ -67,7 +67,7 @@ class Program:
     - `fast`, `careful`: None, or the two programs of a pair (see `careful`); `operations` are those of both.
     """
 
-    # Repetitions of the operations in one call, by which the cost of a `loops.Loop` is estimated.
+    # Repetitions of the operations in one call, by which the cost of a `kernels.Loop` is estimated.
     turns = 1
     is_called = False  # whether it has loops, so that other programs can only call it
 

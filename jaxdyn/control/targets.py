@@ -27,8 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile.kernels import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.compile.known import is_concrete, is_known
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.rank import eps_of

@@ -209,7 +209,8 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
             run = LibraryRun(plan, step_control(solver, size), None, None, size, substeps, room=substeps)
             rows, (result, *_) = (run.direct if is_direct else run)(y, args, ts)
         state = state_of(jax.tree.map(lambda x: x[0], rows), t + length)
-        return (state, ContactStep({}, jnp.zeros_like(v), result, jnp.zeros((), v.dtype))) if report else state
+        none: Any = {"forces": {}, "limit_forces": jnp.zeros_like(v), "residual": jnp.zeros((), v.dtype)}
+        return (state, ContactStep(result=result, **none)) if report else state
 
     return start, advance
 

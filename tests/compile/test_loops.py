@@ -9,7 +9,7 @@ from jaxdyn.compile import compilation, kernel, target
 from jaxdyn.compile.batch import repeat_while
 from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.expansion import expand
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.kernels import Carry, Given, Iteration, Task, run_loop
 
 
 def _turn(tree, constants, state, _):

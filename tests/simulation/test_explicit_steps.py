@@ -10,7 +10,7 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from benchmarks.report_cases import cases, test_set
 from jaxdyn import scenes
-from jaxdyn.compile import loops
+from jaxdyn.compile import kernels
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.simulation.solvers.steps import LibrarySteps
 from jaxdyn.systems.scene import Scene
@@ -88,17 +88,17 @@ def twice(scene):
 def test_stages_at_once_are_those_in_turn(case, monkeypatch):
     """All steps in one kernel, a kernel a step, and without kernels; a batch and one sample."""
     one, vs = batch(*CASES[case]())
-    looped, run_natively = [], loops._run_natively
+    looped, run_natively = [], kernels._run_natively
 
     def counted(*args):
         computed = run_natively(*args)
         looped.append(computed is not None)
         return computed
 
-    monkeypatch.setattr(loops, "_run_natively", counted)
+    monkeypatch.setattr(kernels, "_run_natively", counted)
     computed, alone = quick(jax.vmap(one))(vs), quick(one)(vs[1])
     assert all(looped) and looped
-    monkeypatch.setattr(loops, "_run_natively", lambda *_: None)
+    monkeypatch.setattr(kernels, "_run_natively", lambda *_: None)
     in_turn = quick(jax.vmap(one))(vs)
     with jd.compilation("plain"):
         plain = quick(jax.vmap(one))(vs)

@@ -25,7 +25,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import cond, while_loop
-from jaxdyn.compile.loops import Carry, Given
+from jaxdyn.compile.kernels import Carry, Given
 from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
 from jaxdyn.simulation.hybrid.reactions import Collision

@@ -128,17 +128,12 @@ def normal_load(scene: Scene, element: Element, q, v, t) -> Array:
 
 def extend(scene: Scene) -> Scene:
     """Scene with the rows of its elements behind its own, and without these forces."""
+    elements: list[Any] = [x for x in scene.forces if isinstance(x, WithModes)]
+    rows = [x.contact if isinstance(x, UnilateralContact) else x.along for x in elements]
+    # Behind the scene's own rows, whose indices stay as they are: outputs take the first `own` multipliers.
     return Scene(
         scene.system,
-        # Behind the scene's own rows, whose indices stay as they are: outputs take the first `own` multipliers.
-        (
-            *scene.constraints,
-            *(
-                x.contact if isinstance(x, UnilateralContact) else x.along
-                for x in scene.forces
-                if isinstance(x, WithModes)
-            ),
-        ),
+        (*scene.constraints, *rows),
         tuple(force for force in scene.forces if not isinstance(force, WithModes)),
     )
 

@@ -22,7 +22,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel, reverse_only
-from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_loop
+from jaxdyn.compile.kernels import Carry, Given, Iteration, Passed, Task, run_loop
 from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.simulation.solvers import reverse
 from jaxdyn.simulation.solvers.base import (
