@@ -15,14 +15,7 @@ if TYPE_CHECKING:
     from jaxdyn.simulation.options import Steps as Steps
     from jaxdyn.simulation.solvers.choice import Stiffness as Stiffness
 
-__all__ = [
-    "Baumgarte",
-    "ContactStep",
-    "JointLimitWarning",
-    "Pose",
-    "Steps",
-    "Stiffness",
-]
+__all__ = ["Baumgarte", "ContactStep", "JointLimitWarning", "Pose", "Steps", "Stiffness"]
 
 
 def __dir__() -> list[str]:

@@ -17,13 +17,10 @@ pytestmark = pytest.mark.native
 
 
 @pytest.fixture
-def two_levels(monkeypatch, tmp_path):
+def two_levels(monkeypatch, folder):
     """All code is quick at first, and is not on disk."""
     monkeypatch.delenv("JAXDYN_COMPILATION_OPTIONS", raising=False)
     monkeypatch.setattr(stored, "QUICK_LINES", 0)
-    stored.disk.set_cache_folder(tmp_path)
-    yield
-    stored.disk.set_cache_folder(None)
 
 
 def _solve(A, x):

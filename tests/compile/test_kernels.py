@@ -411,21 +411,8 @@ def test_derivatives_of_every_function():
 def test_derivatives_of_operations():
     """Reverse mode of what moves entries, and of loops."""
     x = 1.5 * normal(3, 4)
-    names = (
-        "reduce",
-        "nothing",
-        "cumsum",
-        "product",
-        "moves",
-        "joins",
-        "pad",
-        "gather",
-        "take",
-        "scatter",
-        "dynamic",
-        "scan",
-    )
-    names += ("dynamic update", "cond", "for", "solve", "barrier", "linear solve", "inner")
+    names = "reduce nothing cumsum product moves joins pad gather take scatter dynamic scan cond for solve barrier inner".split()
+    names += ["dynamic update", "linear solve"]
 
     def plain(x):
         computed = []
@@ -489,14 +476,8 @@ def _mixed(factors, x, n, flag):
     """Arrays of several dtypes and shapes, known numbers, reductions, and outputs that are arguments or constants."""
     rows = jnp.stack([x, factors * x[::-1], jnp.where(flag, x, -x)])
     total = jnp.sum(rows, axis=0) + jnp.min(rows) * n.astype(x.dtype)
-    return {
-        "total": total,
-        "corner": rows[1:, :2],
-        "larger": n + 1,
-        "same": x,
-        "known": jnp.asarray(factors),
-        "which": x > 0,
-    }
+    whole = {"larger": n + 1, "same": x, "known": jnp.asarray(factors), "which": x > 0}
+    return {"total": total, "corner": rows[1:, :2]} | whole
 
 
 FACTORS = np.array([1.0, 0.0, -2.0])
@@ -670,8 +651,7 @@ def test_results_do_not_depend_on_the_level_of_the_compiler(width, monkeypatch):
         return jnp.linalg.solve(A @ A.T + jnp.eye(4), z), jnp.where(z > y, z * y - x, x - z * y)
 
     A, x = rng.normal(size=(9, 4, 4)), rng.normal(size=(9, 4)) * 10
-    made = expand(jax.make_jaxpr(function)(A[0], x[0]), 10**5)[0]
-    text = kernel_ir(made, width, [False, False])
+    text = kernel_ir(numbers_of(function, A[0], x[0]), width, [False, False])
     assert "fmuladd" in text
     results = []
     for level in (0, 1):
@@ -929,29 +909,14 @@ def test_a_kernel_that_is_missing_is_said():
 # --- files of machine code ---
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """A folder of its own for object files."""
-    before = disk._folder, disk._is_off
-    backend_folder = tmp_path / "kernels"
-    disk.set_cache_folder(backend_folder)
-    yield backend_folder
-    disk._folder, disk._is_off = before
-
-
 IR = "define double @f(double %x) {\n  %y = fmul double %x, CONSTANT\n  ret double %y\n}"
 
 
 def code_of(number: float):
-    import ctypes
-
     text = IR.replace("CONSTANT", f"{number:.6e}")
     made = stored.code_of(text)
-    return (
-        stored.name_of_file(hashlib.sha256(text.encode()).hexdigest()),
-        made,
-        ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f")),
-    )
+    function = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f"))
+    return stored.name_of_file(hashlib.sha256(text.encode()).hexdigest()), made, function
 
 
 def built(monkeypatch):
@@ -1089,11 +1054,7 @@ def test_cleared_caches_of_jax_change_nothing():
     np.testing.assert_array_equal(jax.jit(native(jnp.sin))(jnp.ones(3)), before)
 
 
-def test_the_folder_is_the_users_unless_set(monkeypatch, tmp_path):
-    before = disk._folder, disk._is_off
-    try:
-        disk.set_cache_folder(None)
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-        assert disk.cache_folder() == tmp_path / "jaxdyn" / "kernels"
-    finally:
-        disk._folder, disk._is_off = before
+def test_the_folder_is_the_users_unless_set(monkeypatch, folder, tmp_path):
+    disk.set_cache_folder(None)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert disk.cache_folder() == tmp_path / "jaxdyn" / "kernels"

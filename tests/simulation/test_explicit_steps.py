@@ -44,10 +44,7 @@ def test_steps_are_those_of_diffrax(solver, shape):
             rows.append((y, error, output.evaluate(t0 + 0.3 * (t1 - t0)), output.evaluate(t1)))
         return rows
 
-    ours, theirs = (
-        quick(lambda: two_steps(LibrarySteps(solver, field=field)))(),
-        quick(lambda: two_steps(solver))(),
-    )
+    ours, theirs = (quick(lambda: two_steps(LibrarySteps(solver, field=field)))(), quick(lambda: two_steps(solver))())
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-13), ours, theirs)
 
 
@@ -107,20 +104,6 @@ def test_stages_at_once_are_those_in_turn(case, monkeypatch):
         np.testing.assert_allclose(computed.q, wanted.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(computed.v, wanted.v, rtol=0, atol=1e-12)
     np.testing.assert_allclose(alone.q, computed.q[1], rtol=0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_derivatives_are_those_without_kernels():
-    one, vs = batch(*CASES["free body"]())
-
-    def end(v):
-        return jnp.sum(one(v).q[-1, :2] ** 2)
-
-    gradient = jax.jit(jax.vmap(jax.grad(end)))(vs)
-    with jd.compilation("plain"):
-        wanted = jax.jit(jax.vmap(jax.grad(end)))(vs)
-    np.testing.assert_allclose(gradient, wanted, rtol=1e-12, atol=1e-12)
-    assert np.abs(wanted).max() > 0.01
 
 
 # --- whole motions in both modes ---

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
+from mechanisms import slider
 from pinocchio_bridge import ROBOTS, assert_close, quick, to_jaxdyn
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -89,15 +90,8 @@ def test_projected_solver_steps_on_the_manifold_and_evaluates_the_first_stage_an
             y1, error, dense, state, _ = solver.step(term, k * h, (k + 1) * h, y0, None, state, False)
             interpolation = solver.interpolation_cls(t0=jnp.asarray(k * h), t1=jnp.asarray((k + 1) * h), **dense)
             ends = [interpolation.evaluate(jnp.asarray(x)) for x in (k * h, (k + 1) * h)]
-            computed = (
-                y0,
-                y1,
-                error,
-                jax.tree.map(lambda k: k[0] / h, dense["dense_info"]["k"]),
-                dense["shift"],
-                *ends,
-            )
-            out.append([y["x"] for y in computed])
+            first_stage = jax.tree.map(lambda k: k[0] / h, dense["dense_info"]["k"])
+            out.append([y["x"] for y in (y0, y1, error, first_stage, dense["shift"], *ends)])
             y0 = y1
         return out
 
@@ -209,21 +203,12 @@ def driven(leg):
     """The leg with damping, friction, a spring and a control, with every output."""
     forces = (JointDamping(0.1), CoulombFriction(0.05, v_s=0.5), JointSpring(1.5))
     control = Feedback(jnp.asarray(0.05), jnp.asarray([0.3, -0.2, 0.1, 0.4]))
-    outputs = ("energy", "work", "power", "acceleration", Pose("foot"))
+    options = {
+        "stepsize": Steps(rtol=1e-12, atol=1e-12),
+        "outputs": ("energy", "work", "power", "acceleration", Pose("foot")),
+    }
     scene = Scene(leg, forces=forces)
-    return (
-        scene,
-        control,
-        simulate(
-            scene,
-            Q0,
-            V0,
-            np.linspace(0, 2, 401),
-            control=control,
-            stepsize=Steps(rtol=1e-12, atol=1e-12),
-            outputs=outputs,
-        ),
-    )
+    return scene, control, simulate(scene, Q0, V0, np.linspace(0, 2, 401), control=control, **options)
 
 
 @pytest.mark.long
@@ -263,9 +248,7 @@ def test_outputs_are_those_of_the_saved_states(driven, leg):
 @pytest.mark.slow
 def test_stiff_friction_with_an_implicit_method():
     """Dry friction smoothed over 1e-5 m/s: sinh(v / v_s) decays at level / (m v_s) = 5e4 1/s."""
-    builder = ModelBuilder("slider", gravity=None)
-    builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(2.0, (0, 0, 0), (0, 0, 0)))
-    scene = Scene(builder.build(), forces=(CoulombFriction(1.0, v_s=1e-5),))
+    scene = Scene(slider(2.0), forces=(CoulombFriction(1.0, v_s=1e-5),))
     # It slides from 1 m/s at -0.5 m/s^2 and is at rest, all but v_s, at 2 s.
     ts = np.array([0.0, 0.5, 1.0, 1.9, 2.5, 4.0])
     solution = simulate(scene, [0.0], [1.0], ts, solver=diffrax.Kvaerno5(), stepsize=Steps(rtol=1e-8, atol=1e-10))

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 import pytest
+from mechanisms import slider
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
@@ -14,14 +15,6 @@ from benchmarks.stiff import SOLVERS, cases, program, reference, runner
 from jaxdyn.compile import inverse, kernel
 from jaxdyn.model.configuration import map_joints
 from jaxdyn.simulation.solvers.diffrax_methods import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P, _local_rate
-
-
-def slider(mass=1.0):
-    """A body on a rail."""
-    builder = jd.ModelBuilder("slider", gravity=None)
-    builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
-    return builder.build()
-
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The first step
@@ -71,12 +64,7 @@ def test_coefficients_of_the_rosenbrock_method():
         1: [(one, 1)],
         2: [(bb, 1 / 2)],
         3: [(c**2, 1 / 3), (beta @ bb, 1 / 6)],
-        4: [
-            (c**3, 1 / 4),
-            (c * (alpha @ bb), 1 / 8),
-            (beta @ c**2, 1 / 12),
-            (beta @ beta @ bb, 1 / 24),
-        ],
+        4: [(c**3, 1 / 4), (c * (alpha @ bb), 1 / 8), (beta @ c**2, 1 / 12), (beta @ beta @ bb, 1 / 24)],
         5: [
             (c**4, 1 / 5),
             (c**2 * (alpha @ bb), 1 / 10),
@@ -391,9 +379,7 @@ def test_implicit_explicit_split():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "solver",
-    [diffrax.Dopri8(), pytest.param(jd.solvers.Rodas5P(), marks=pytest.mark.slow)],
-    ids=["Dopri8", "Rodas5P"],
+    "solver", [diffrax.Dopri8(), pytest.param(jd.solvers.Rodas5P(), marks=pytest.mark.slow)], ids=["Dopri8", "Rodas5P"]
 )
 def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
     """Reverse mode over 200 to 900 steps from 45 checkpoints, forward mode, and differences, by a spring's stiffness.
