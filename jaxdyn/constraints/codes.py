@@ -195,12 +195,10 @@ def name_of(result: Any) -> str:
 class Outcome(eqx.Module):
     """Base of outcomes with a `result`, one of `RESULTS`."""
 
-    result: eqx.AbstractVar[Any]
-
     @property
     def success(self) -> Bool[Array, "..."]:
         """True where `result` is `RESULTS.successful`."""
-        return self.result == RESULTS.successful
+        return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def require_success(outcome: Any, throw: bool | None, message: Callable[[Any], str]) -> Any:
