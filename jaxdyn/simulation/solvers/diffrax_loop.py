@@ -246,7 +246,7 @@ def _state(t, y, args):
 
 
 # Fractions of a step at which diffrax's loop evaluates the allowances.
-_FRACTIONS = tuple(i / 8 for i in range(1, 8))
+_FRACTIONS = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 
 
 class GuardedSolver(Wrapped):
