@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from pinocchio_bridge import quick
 from scipy.integrate import solve_ivp
 
@@ -24,7 +25,7 @@ from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem
 
-TIGHT = {"stepsize": Steps(rtol=1e-12, atol=1e-12)}
+TIGHT = {"stepsize": within(1e-12)}
 
 
 def motion(scene, state, ts, **options):
@@ -63,9 +64,7 @@ def test_a01_pendulum_in_plane():
 @pytest.mark.long
 def test_car_axis():
     """Moving constraints, all components at t = 3 (published, quadruple precision)."""
-    computed = motion(
-        test_set.car_axis(), test_set.car_axis.start(), [0.0, 3.0], stepsize=Steps(rtol=1e-11, atol=1e-11)
-    )
+    computed = motion(test_set.car_axis(), test_set.car_axis.start(), [0.0, 3.0], stepsize=within(1e-11))
     q = [0.493455784275402809122e-1, 0.496989460230171153861, 0.104174252488542151681e1, 0.373911027265361256927]
     v = [-0.770583684040972357970e-1, 0.744686658723778553466e-2, 0.175568157537232222276e-1, 0.770341043779251976443]
     np.testing.assert_allclose(computed.q[-1], q, atol=1e-9)
@@ -75,9 +74,7 @@ def test_car_axis():
 @pytest.mark.slow
 def test_andrews():
     """Positions published to 1e-10, velocities to 5e-8 relative; the energy balance is exact."""
-    computed = motion(
-        test_set.andrews(), test_set.andrews.start(), [0.0, 0.01, 0.02, 0.03], stepsize=Steps(rtol=1e-13, atol=1e-13)
-    )
+    computed = motion(test_set.andrews(), test_set.andrews.start(), [0.0, 0.01, 0.02, 0.03], stepsize=within(1e-13))
     q = [15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948]
     q += [0.5244099658805304, 0.5347301163226948, 1.048080741042263]
     v = [1139.920302151208, -1424.379294994111, 11.03291221937134, 19.29337464421385]
@@ -189,7 +186,7 @@ def test_projection_keeps_the_order(solver, order):
         steps = Steps(step, rtol=tolerance, atol=tolerance, max_steps=512)
         return simulate(scene, q, v, ts, stepsize=steps, solver=solver).q
 
-    exact = quick(lambda: simulate(scene, q, v, ts, stepsize=Steps(rtol=1e-13, atol=1e-13)).q)()
+    exact = quick(lambda: simulate(scene, q, v, ts, stepsize=within(1e-13)).q)()
     steps = [0.1, 0.05] if order == 8 else [0.05, 0.025]
     errors = [np.abs(run(step)[-1] - exact[-1]).max() for step in steps]
     assert np.log2(errors[0] / errors[1]) > order - 0.6
@@ -203,7 +200,7 @@ def test_without_projection_the_constraint_opens():
 
     @quick
     def run():
-        options = {"stepsize": Steps(rtol=1e-8, atol=1e-8), "outputs": ("constraint_residual", "multipliers")}
+        options = {"stepsize": within(1e-8), "outputs": ("constraint_residual", "multipliers")}
         return simulate(scene, q, v, jnp.asarray([0.0, 10.0]), method="multipliers", **options)
 
     computed = run()
@@ -284,7 +281,7 @@ def test_rows_that_open_within_their_rank_tolerance_do_not_contradict():
     @quick
     def run(q, v):
         options = {"method": Multipliers(rank_tol=1e-4), "outputs": ("constraint_residual",)}
-        return simulate(scenes.bennett(), q, v, [0.0, 3.0], stepsize=Steps(rtol=1e-5, atol=1e-5), **options)
+        return simulate(scenes.bennett(), q, v, [0.0, 3.0], stepsize=within(1e-5), **options)
 
     computed = run(*start)
     assert computed.success and 1e-7 < float(computed.constraint_residual[-1].max()) < 1e-4
@@ -369,7 +366,7 @@ def test_both_branches_pass_their_flat_position(branch, in_plane):
     np.testing.assert_allclose(state.q, [crank, coupler, rocker], atol=1e-12)
     ts = np.linspace(0.0, 1.0, 8)
     rates = state.v * 4.0 / state.v[0]
-    computed = motion(scene, (state.q, rates), ts, stepsize=Steps(rtol=1e-10, atol=1e-10))
+    computed = motion(scene, (state.q, rates), ts, stepsize=within(1e-10))
     first, last = np.asarray(computed.q[:, 0]), np.asarray(computed.q[:, 2])
     # The flat positions: pi, and zero.
     passed = first - np.pi if branch == "parallelogram" else first

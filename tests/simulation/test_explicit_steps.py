@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
@@ -116,7 +117,7 @@ def motion(name, **options):
     ts = jnp.asarray(case.ts[:4])
 
     def run(q, v, tolerance):
-        steps = {"stepsize": jd.simulation.Steps(rtol=tolerance, atol=tolerance)} if "stepsize" not in options else {}
+        steps = {"stepsize": within(tolerance)} if "stepsize" not in options else {}
         return jd.simulate(scene, q, v, ts, throw=False, **steps, **options)
 
     return run, (jnp.asarray(q), jnp.asarray(v), jnp.asarray(1e-9))
@@ -161,9 +162,7 @@ def test_dependent_rows_take_the_careful_way():
 
     def run(scene):
         ts = jnp.linspace(0.0, 0.2, 3)
-        return jax.jit(
-            lambda q, v: jd.simulate(scene, q, v, ts, throw=False, stepsize=jd.simulation.Steps(rtol=1e-8, atol=1e-8))
-        )(q, v)
+        return jax.jit(lambda q, v: jd.simulate(scene, q, v, ts, throw=False, stepsize=within(1e-8)))(q, v)
 
     computed = run(scene)
     with jd.compilation("plain"):
@@ -180,9 +179,7 @@ def test_derivatives_of_a_constrained_motion():
     v, ts = jnp.asarray(v), jnp.linspace(0.0, 0.5, 3)
 
     def end(v, adjoint):
-        computed = jd.simulate(
-            scene, q, v, ts, throw=False, stepsize=jd.simulation.Steps(rtol=1e-6, atol=1e-6), adjoint=adjoint
-        )
+        computed = jd.simulate(scene, q, v, ts, throw=False, stepsize=within(1e-6), adjoint=adjoint)
         return jnp.sum(computed.q[-1] ** 2)
 
     def reverse():

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
@@ -18,7 +19,7 @@ from jaxdyn.simulation.solvers.guards import Point, Search, search_root
 TS = np.linspace(0.0, 3.0, 7)
 STOPS = [jd.events.JointLimit()]
 ROUNDING = np.finfo(float).eps ** 0.5  # that conditions let pass, of the size of a limit or a force
-TIGHT: dict[str, Any] = {"stepsize": jd.simulation.Steps(rtol=1e-12, atol=1e-12)}
+TIGHT: dict[str, Any] = {"stepsize": within(1e-12)}
 WEIGHT = 2.0 * 9.81
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z of the contact along y of the plane
 
@@ -161,7 +162,7 @@ def test_a_single_motion_has_both_modes(name):
 def test_implicit_steps_find_the_same_time(name):
     """In the loop of diffrax, by its dense output of third order."""
     case = CASES[name]
-    options: dict[str, Any] = {"solver": diffrax.Kvaerno5(), "stepsize": jd.simulation.Steps(rtol=1e-9, atol=1e-9)}
+    options: dict[str, Any] = {"solver": diffrax.Kvaerno5(), "stepsize": within(1e-9)}
     gradient = jax.value_and_grad(end_of(case.move, **options), has_aux=True)
     (times, solution), derivatives = jax.jit(jax.vmap(gradient))(jnp.asarray(case.numbers))
     assert np.asarray(solution.result == getattr(jd.RESULTS, case.code)).all()
@@ -184,11 +185,7 @@ def test_a_basis_and_limits_in_one_run_have_derivatives():
         run = jd.simulate(limits, q, rate * v, jnp.linspace(0.0, 1.0, 5), events=STOPS, throw=False, **options)
         return run.stats["time_reached"]
 
-    implicit: dict[str, Any] = {
-        "method": "reduced",
-        "solver": diffrax.Kvaerno5(),
-        "stepsize": jd.simulation.Steps(rtol=1e-9, atol=1e-9),
-    }
+    implicit: dict[str, Any] = {"method": "reduced", "solver": diffrax.Kvaerno5(), "stepsize": within(1e-9)}
     computed, expected = (jax.value_and_grad(time)(1.0, **options) for options in (implicit, TIGHT))
     np.testing.assert_allclose(computed, expected, rtol=1e-5)
 

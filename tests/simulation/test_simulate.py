@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from mechanisms import slider
+from motion_helpers import central_difference, within
 from pinocchio_bridge import ROBOTS, assert_close, quick, to_jaxdyn
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -192,7 +193,7 @@ def test_panda_against_pinocchio_and_scipy():
     reference = solve_ivp(rate, (0, 1), x0, "DOP853", ts, rtol=1e-12, atol=1e-12).y.T
     scene = Scene(model, forces=(JointDamping(2.0),))
     control = Feedback(jnp.asarray(0.4), jnp.asarray(push))
-    solution = simulate(scene, q0, v0, ts, control=control, stepsize=Steps(rtol=1e-12, atol=1e-12))
+    solution = simulate(scene, q0, v0, ts, control=control, stepsize=within(1e-12))
     scale = np.abs(reference[:, robot.nq :]).max()
     np.testing.assert_allclose(solution.q, reference[:, : robot.nq], rtol=0, atol=1e-9)
     np.testing.assert_allclose(solution.v, reference[:, robot.nq :], rtol=0, atol=1e-9 * scale)
@@ -203,10 +204,7 @@ def driven(leg):
     """The leg with damping, friction, a spring and a control, with every output."""
     forces = (JointDamping(0.1), CoulombFriction(0.05, v_s=0.5), JointSpring(1.5))
     control = Feedback(jnp.asarray(0.05), jnp.asarray([0.3, -0.2, 0.1, 0.4]))
-    options = {
-        "stepsize": Steps(rtol=1e-12, atol=1e-12),
-        "outputs": ("energy", "work", "power", "acceleration", Pose("foot")),
-    }
+    options = {"stepsize": within(1e-12), "outputs": ("energy", "work", "power", "acceleration", Pose("foot"))}
     scene = Scene(leg, forces=forces)
     return scene, control, simulate(scene, Q0, V0, np.linspace(0, 2, 401), control=control, **options)
 
@@ -279,20 +277,12 @@ def leg_end(leg, z, q0, **options):
     return jnp.sum(out.q[-1] * jnp.arange(1.0, 6.0)) + jnp.sum(out.v[1:] * jnp.arange(1.0, 5.0)[None])
 
 
-def central_difference(function, point, step=1e-4):
-    """Fourth-order differences of a batched function, every coordinate in one call."""
-    offsets = step * np.array([1, -1, 2, -2])[:, None, None] * np.eye(point.size)
-    values = np.asarray(function(jnp.asarray((point + offsets).reshape(-1, point.size))))
-    one, minus, two, minus_two = values.reshape(4, point.size, *values.shape[1:])
-    return (8 * (one - minus) - (two - minus_two)) / (12 * step)
-
-
 @pytest.mark.long
 def test_reverse_mode_against_finite_differences(leg):
     """Masses, start, coefficients and control, with adaptive steps; and finite at rest, where error estimates vanish."""
 
     def function(z, q0):
-        return leg_end(leg, z, q0, stepsize=Steps(rtol=1e-13, atol=1e-13))
+        return leg_end(leg, z, q0, stepsize=within(1e-13))
 
     q0 = jnp.asarray(Q0)
     slope = central_difference(quick(jax.vmap(lambda z: function(z, q0))), POINT)
@@ -347,7 +337,7 @@ def test_modes_and_second_order(pendulum):
 def test_continuous_adjoint(pendulum):
     """Its gradients are those of the exact motion, to the tolerance of the solution."""
     z = jnp.asarray([1.2, 0.7, -0.5, 0.1, 0.05, 0.3])
-    tight = {"stepsize": Steps(rtol=1e-10, atol=1e-10)}
+    tight = {"stepsize": within(1e-10)}
     gradient = quick(jax.grad(lambda z: swing(pendulum, z, adjoint="backsolve", **tight)))(z)
     expected = quick(jax.grad(lambda z: swing(pendulum, z, **tight)))(z)
     np.testing.assert_allclose(gradient, expected, rtol=1e-7)
