@@ -6,7 +6,7 @@ A plain control is tau(q, v, t). A `Controller` also has a state z, integrated w
 
 The constraint forces lam depend on tau. If they are fed back through z there is no algebraic loop, because tau depends on z and
 not on lam. If tau depends on lam directly, lam = lam(tau(lam)) has to be solved. The dynamics are affine in tau, so that this is
-a linear equation if the law is affine in lam (`_solve_affine_loop`). A `Sampled` law is called once per period, and its torque is
+a linear equation if the law is affine in lam (see `torque`). A `Sampled` law is called once per period, and its torque is
 held in between.
 
 The state of the differential equation (`Method`) is a dictionary. A control adds "control", the state z as a vector, or "held",
