@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Rows, layout, position_residual, rows
+from jaxdyn.constraints.redundancy import add_constraints
 from jaxdyn.contact.unilateral import UnilateralContact, WithModes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import Pieces
@@ -129,13 +130,9 @@ def normal_load(scene: Scene, element: Element, q, v, t) -> Array:
 def extend(scene: Scene) -> Scene:
     """Scene with the rows of its elements behind its own, and without these forces."""
     elements: list[Any] = [x for x in scene.forces if isinstance(x, WithModes)]
-    rows = [x.contact if isinstance(x, UnilateralContact) else x.along for x in elements]
     # Behind the scene's own rows, whose indices stay as they are: outputs take the first `own` multipliers.
-    return Scene(
-        scene.system,
-        (*scene.constraints, *rows),
-        tuple(force for force in scene.forces if not isinstance(force, WithModes)),
-    )
+    more = [x.contact if isinstance(x, UnilateralContact) else x.along for x in elements]
+    return add_constraints(scene, more, [force for force in scene.forces if not isinstance(force, WithModes)])
 
 
 def elements_of(scene: Scene, pieces: Pieces) -> Elements:
