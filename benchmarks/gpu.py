@@ -391,7 +391,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="with --count: part of the names of functions")
     args = parser.parse_args()
     if args.count:
-        from jaxdyn.compile.gpu import device as gpu_device
+        from jaxdyn.compile import gpu as gpu_device
 
         # What native kernels ask the driver for before anything is launched: the architecture, that of an H100.
         gpu_device.driver = lambda: SimpleNamespace(architecture=90, launch=0)

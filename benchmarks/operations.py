@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from jaxdyn.compile.inlining import inline
+from jaxdyn.compile.derive import inline
 
 # What is carried out for some samples alone, as a second solution of rows that depend on each other, is left out.
 _NOT_ALWAYS = ("cond", "while")

@@ -22,7 +22,7 @@ from jax import lax
 import jaxdyn as jd
 from benchmarks import first_calls, timing
 from benchmarks.first_calls import CLOCKS
-from jaxdyn.compile import array_rules, batch, expansion, loops, primitive
+from jaxdyn.compile import array_rules, batch, expansion, kernels, primitive
 
 CALLS = 20  # in a round
 
@@ -53,7 +53,7 @@ def accelerations(which) -> Callable:
 
 def without_loop() -> None:
     """Steps are turns of a loop of XLA's."""
-    patched: Any = loops
+    patched: Any = kernels
     patched._run_natively = lambda *_: None
 
 

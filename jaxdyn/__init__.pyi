@@ -64,8 +64,8 @@ from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Multipliers, Projected, Reduced
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import Solution
+from jaxdyn.simulation.solvers.choice import stiffness
 from jaxdyn.simulation.stepping import stepper
-from jaxdyn.simulation.stiffness import stiffness
 from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene

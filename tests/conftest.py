@@ -114,6 +114,17 @@ def mode(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """A folder of its own for what the compiler keeps on disk."""
+    from jaxdyn.compile import disk
+
+    before = disk._folder, disk._is_off
+    disk.set_cache_folder(tmp_path / "kernels")
+    yield tmp_path / "kernels"
+    disk._folder, disk._is_off = before
+
+
+@pytest.fixture
 def as_users_have_it() -> Iterator[None]:
     """Without the checks of annotations that the tests put before all functions."""
     jaxtyping.config.update("jaxtyping_disable", True)

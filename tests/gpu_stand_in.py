@@ -9,9 +9,10 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 
-from jaxdyn.compile import objects, primitive
+from jaxdyn.compile import gpu as device
+from jaxdyn.compile import primitive, stored
 from jaxdyn.compile.code import varying_first
-from jaxdyn.compile.gpu import device, ptx
+from jaxdyn.compile.gpu import ptx
 
 HOST_SAMPLE = """@jaxdyn_sample = thread_local global i64 0
 define internal i64 @sample() {
@@ -29,7 +30,7 @@ class HostKernel:
     """A kernel for GPUs as machine code of this processor."""
 
     def __init__(self, module: str):
-        self.code = objects.Code(objects.compile_text(host_text(module)))
+        self.code = stored.Code(stored.compile_text(host_text(module)))
         self.address = self.code.address(ptx.KERNEL)
         self.arrays = module.partition(f"@{ptx.KERNEL}(")[2].partition(")")[0].count("ptr ")
         self.sample = ctypes.c_int64.from_address(self.code.engine.get_global_value_address("jaxdyn_sample"))

@@ -1,4 +1,4 @@
-"""Parallel robots that several tests share: a Stewart platform and a delta robot, with closed forms of their positions."""
+"""Models that several tests share: a rail; a Stewart platform and a delta robot, with closed forms of their positions."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +7,13 @@ from jaxdyn.constraints import loop
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import neutral
 from jaxdyn.systems.scene import Scene
+
+
+def slider(mass=1.0):
+    """A body on a rail, without gravity."""
+    builder = ModelBuilder("slider", gravity=None)
+    builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
+    return builder.build()
 
 
 def _on_circle(radius, degrees):

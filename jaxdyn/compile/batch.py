@@ -138,7 +138,9 @@ def map_rows(function: Callable, rows):
 # --- sweeps over a tree, from the root to the leaves or back, as loops in native code (see `scan`) or of JAX ---
 
 
-def sweep(step: Callable, parents: Sequence[int], start, rows, *, inward: bool = False) -> tuple[Any, Any]:
+def sweep(
+    step: Callable, parents: Sequence[int], start, rows, *, inward: bool = False, by_arrays: Callable | None = None
+) -> tuple[Any, Any]:
     """Compute a quantity of each node of a tree from that of its parent, or from those of its children.
 
         outward    c_i, y_i = step(c_parent(i), x_i)               c_root = start
@@ -146,10 +148,13 @@ def sweep(step: Callable, parents: Sequence[int], start, rows, *, inward: bool =
 
     **Arguments:** `parents`: of each node, -1 for the root, in an order in which parents precede their children. `start`: pytree
     of the root's c; inward it is added to the sum of the last node (zeros, usually). `rows`: pytree of x (n, ...), floats alone.
+    `by_arrays()`: the same by operations on all rows at once, which outside of native code are faster than a loop.
 
     **Returns:** outward, c of the last node, and inward, the sum of the root; and y (n, ...).
     """
     if not mode.is_expanding():
+        if by_arrays is not None:
+            return by_arrays()
         if is_chain(parents):
             return lax.scan(step, start, rows, reverse=inward)
         return _sweep_by_jax(step, parents, start, rows, inward)

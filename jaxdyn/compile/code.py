@@ -18,6 +18,7 @@ from jaxdyn.compile.body import (
     bytes_of,
     copy_bytes,
     fill_zeros,
+    has_loop,
     has_zeros,
     is_zero,
     on_heap,
@@ -25,18 +26,31 @@ from jaxdyn.compile.body import (
     unpack,
     write_call,
 )
-from jaxdyn.compile.listing import Listing, has_table
+from jaxdyn.compile.listing import Listing
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import FLOATS, Array, Program, kind_of
 
 # A program of one sample with at least so many operations is compiled once for all kernels that contain it: the copies of a
 # call's arguments are few against them.
 MIN_SHARED_OPERATIONS = 2000
+# Operations from which on a program is a listing, and those of one that calls loops: arithmetic on the arrays that loops take and
+# return is written out entry by entry, and LLVM takes longer for operations on memory than for others.
+MIN_LISTED_OPERATIONS, MIN_LISTED_BESIDE_LOOPS = 60_000, 40_000
+# Those from which on it is one until LLVM has compiled it: at its lowest level that takes a fifth of a second.
+MIN_QUICK_OPERATIONS = 5_000
 ATTRIBUTES = (
     # LLVM's simplifications of calls of the C library, such as pow(x, 2) = x x, are made at some levels alone.
     'attributes #0 = { nounwind "no-builtins" }',
     "attributes #1 = { nounwind willreturn memory(none) }",
 )
+
+
+def has_table(program: Program, is_quick: bool = False) -> bool:
+    """Decide whether the operations of a program are data of its code, or of that which runs until the other is there."""
+    count = sum(op not in ("input", "part") for op, _, _ in program.operations)
+    if is_quick:
+        return count > MIN_QUICK_OPERATIONS
+    return count > (MIN_LISTED_BESIDE_LOOPS if any(map(has_loop, program.subprograms)) else MIN_LISTED_OPERATIONS)
 
 
 def body_of(e: Emitter, program: Program, load: Callable, array: Callable, is_quick: bool = False) -> Body:

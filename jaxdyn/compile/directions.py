@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from jaxdyn.compile.body import Body
+from jaxdyn.compile.derive import replay
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import replay
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, Constant, NotNumbers, Number, Program, dtype_of, kind_of, objects
 

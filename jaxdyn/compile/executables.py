@@ -1,4 +1,6 @@
-"""Entry points as executables that are kept on disk: in a second process nothing of them is traced, lowered or compiled.
+"""What is called outside of traces: entry points, numbers of known arguments, and the trial of an unknown version of JAX.
+
+Entry points are executables that are kept on disk: in a second process nothing of them is traced, lowered or compiled.
 
 An executable belongs to a function, the structure and the types of its arguments, everything static in them, and JAX's options.
 In this process it is found by these, on disk by the hash of their contents (`stored.key_of`). Where they have none, as code of
@@ -12,13 +14,17 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import disk, jax_adapter, mode, stored
-from jaxdyn.compile.first_calls import phase
+from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.jax_adapter import select_options
-from jaxdyn.compile.known import is_concrete, is_tracing
+from jaxdyn.compile.kernels import call_program
+from jaxdyn.compile.known import is_concrete, is_tracing, partition
+from jaxdyn.compile.mode import phase
 from jaxdyn.compile.primitive import target
+from jaxdyn.compile.trace import program_of, trace_program
 
 # What a stored executable may call: kernels, which are restored with it, and functions that every jaxlib has. A call of
 # anything else may hold an address of the process that made it.
@@ -250,3 +256,101 @@ def glue_options(platform: str) -> dict[str, Any] | None:
 
 def _is_glue(platform: str) -> bool:
     return mode.current() != "plain" and platform == "cpu"
+
+
+# --- numbers that are known ---
+
+
+def evaluate(function: Callable, tree, *args, static: tuple = (), is_input: bool = False):
+    """function(*static, tree, *args) for known numbers, also while another program is traced; see `Evaluation`."""
+    return Evaluation(function, tree, static, is_input)(*args)
+
+
+class Evaluation:
+    """function(*static, tree, *args) of a known tree, for many calls with known numbers; results are numpy arrays.
+
+    **Arguments:** as of `kernel`; `is_input`: whether the tree's arrays are operands of the kernel too, as they are in a program
+    that takes the tree as an argument: it is the same kernel then.
+    """
+
+    def __init__(self, function: Callable, tree, static: tuple = (), is_input: bool = False):
+        self.function, self.tree, self.static = function, tree, static
+        inputs, self.known = partition(tree, jax.Array if is_input else ())
+        self.inputs = [_as_canonical(x) for x in inputs]
+        self.found: dict[Any, tuple | None] = {}
+
+    def __call__(self, *args):
+        """The results, by native code without XLA: a call through XLA would be staged into a trace around it."""
+        leaves, structure = jax.tree.flatten(args)
+        leaves = [_as_canonical(x) for x in leaves]
+        if mode.current() != "plain" and target is not None:
+            key = structure, tuple([(x.shape, x.dtype) for x in leaves]), mode.state_of_programs()
+            if key not in self.found:
+                self.found[key] = self._find(structure, leaves)
+            if (found := self.found[key]) is not None:
+                call, places, results = found
+                try:
+                    return jax.tree.unflatten(results, call([leaves[i] for i in places]))
+                except Exception as error:
+                    if not isinstance(error, target.Unsupported) and not jax_adapter.forgive(error):
+                        raise
+        with jax.ensure_compile_time_eval():
+            return jax.tree.map(np.asarray, self.function(*self.static, self.tree, *map(jnp.asarray, args)))
+
+    def _find(self, structure, leaves) -> tuple | None:
+        """The native call, the places of its operands among the leaves, and the structure of its results."""
+        count, shapes = len(self.inputs), tuple((x.shape, x.dtype) for x in (*self.inputs, *leaves))
+        # With the arguments of `_bind`, so that both share one trace.
+        traced = trace_program(self.function, self.static, self.known, count, structure, shapes, flags="repair")
+        if isinstance(traced, str):
+            return None
+        program, places = without_unread(traced[0])
+        fixed = {k: self.inputs[i] for k, i in enumerate(places) if i < count}
+        return target.Call(program, fixed), [i - count for i in places if i >= count], traced[1]
+
+
+def _as_canonical(x) -> np.ndarray:
+    x = np.asarray(x)
+    return x.astype(jax.dtypes.canonicalize_dtype(x.dtype), copy=False)
+
+
+# --- a kernel through all rules of its primitive, against JAX: what an unknown version of JAX has to pass before the first ---
+#
+# Rules are called by JAX in the midst of its transformations, where an error could no longer be made good.
+
+
+def _sample(known, x, y):
+    del known
+    return x * jnp.sin(y), jnp.sum(x / (2 + y * y))
+
+
+def _kernel(x, y):
+    leaves, expanded = program_of(_sample, (), None, (x, y))
+    program, structure = expanded
+    return jax.tree.unflatten(structure, call_program(program, leaves))
+
+
+def _transforms(function, x, y) -> list:
+    def slope(x, y):
+        return jax.grad(lambda x, y: jnp.sum(function(x, y)[0]) + function(x, y)[1], (0, 1))(x, y)
+
+    # Values, a jvp, a batch with a shared argument and a batched gradient: every rule of the primitive is called once.
+    batches = [jax.jit(jax.vmap(f, (0, None)))(x, y) for f in (function, slope)]
+    return [jax.jit(function)(x[0], y), jax.jvp(function, (x[0], y), (y, y)), *batches]
+
+
+def run_trial() -> None:
+    """**Raises:** whatever goes wrong, and ArithmeticError where numbers differ."""
+    if target is None:
+        return
+    # Before anything is traced: XLA may refuse the handler.
+    target.register()
+    x, y = jnp.arange(12.0).reshape(4, 3), jnp.arange(3.0)
+    computed, wanted = (_transforms(f, x, y) for f in (_kernel, functools.partial(_sample, None)))
+    for mine, theirs in zip(jax.tree.leaves(computed), jax.tree.leaves(wanted), strict=True):
+        # Loose, as the trial looks for other rules, not for rounding, and may run in float32.
+        if mine.shape != theirs.shape or not np.allclose(mine, theirs, 1e-4, 1e-4):
+            raise ArithmeticError("a kernel gives other numbers than JAX")
+
+
+jax_adapter.try_first(run_trial)

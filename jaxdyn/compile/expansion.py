@@ -16,9 +16,8 @@ import numpy as np
 from jaxdyn.compile import array_rules, jax_adapter, mode, rearrange, rolled
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
-from jaxdyn.compile.derive import without_unread
+from jaxdyn.compile.derive import replay, without_unread
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import replay
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,

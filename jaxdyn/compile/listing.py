@@ -12,36 +12,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from jaxdyn.compile import careful
-from jaxdyn.compile.body import (
-    Body,
-    allocation,
-    bytes_of,
-    copy_bytes,
-    fill_zeros,
-    has_loop,
-    has_zeros,
-    is_zero,
-    write_call,
-)
+from jaxdyn.compile.body import Body, allocation, bytes_of, copy_bytes, fill_zeros, has_zeros, is_zero, write_call
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import COMPARISONS, Array, Constant, Program, dtype_of, kind_of
 
-# Operations from which on a program is a listing, and those of one that calls loops: arithmetic on the arrays that loops take and
-# return is written out entry by entry, and LLVM takes longer for operations on memory than for others.
-MIN_LISTED_OPERATIONS, MIN_LISTED_BESIDE_LOOPS = 60_000, 40_000
-# Those from which on it is one until LLVM has compiled it: at its lowest level that takes a fifth of a second.
-MIN_QUICK_OPERATIONS = 5_000
 _COLUMNS = 5  # of the table: code, result, three operands
 _ESCAPED = [f"\\{x:02X}" for x in range(256)]
-
-
-def has_table(program: Program, is_quick: bool = False) -> bool:
-    """Decide whether the operations of a program are data of its code, or of that which runs until the other is there."""
-    count = sum(op not in ("input", "part") for op, _, _ in program.operations)
-    if is_quick:
-        return count > MIN_QUICK_OPERATIONS
-    return count > (MIN_LISTED_BESIDE_LOOPS if any(map(has_loop, program.subprograms)) else MIN_LISTED_OPERATIONS)
 
 
 class Listing(Body):

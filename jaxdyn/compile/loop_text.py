@@ -1,4 +1,4 @@
-"""Text of native loops (see `loops`): LLVM's intermediate representation around the programs of a turn and of a row.
+"""Text of native loops (see `kernels`): LLVM's intermediate representation around the programs of a turn and of a row.
 
 entry   pointers
 block   the next samples: constants and states are copied to local memory, rows and records to the results

@@ -12,7 +12,7 @@ from jax import lax
 
 from jaxdyn.compile.batch import cond, sweep
 from jaxdyn.compile.careful import Careful
-from jaxdyn.compile.inlining import inline
+from jaxdyn.compile.derive import inline
 from jaxdyn.compile.llvm import COSINE, HALF_PI, MAX_ANGLE, SINE
 from jaxdyn.compile.program import COMPARISONS, Constant, Program, dtype_of
 from jaxdyn.compile.scan import Scan

@@ -331,8 +331,5 @@ def triangular_solution(factor: jax.Array, right: jax.Array, transposed: bool = 
 
     constant = lax.stop_gradient(factor)
     return lax.custom_linear_solve(
-        multiply,
-        right,
-        lambda _, x: solve(constant, x, transposed),
-        lambda _, x: solve(constant, x, not transposed),
+        multiply, right, lambda _, x: solve(constant, x, transposed), lambda _, x: solve(constant, x, not transposed)
     )

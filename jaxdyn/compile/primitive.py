@@ -287,14 +287,14 @@ def _lower_to_call(ctx, *operands, program, rows, on_gpu=False):
 def _lower_to_launch(ctx, *operands, program, rows, uniform):
     """The call of a kernel on a GPU."""
     assert target is not None, "kernels need llvmlite"
-    from jaxdyn.compile.gpu import device  # here, as hardly anybody needs it
+    from jaxdyn.compile import gpu  # here, as hardly anybody needs it
 
     try:
-        number = device.kernel(program, uniform)
+        number = gpu.kernel(program, uniform)
     except jax_adapter.Unsupported as reason:
         mode.say_once(f"functions run on JAX's own operations on GPUs: {reason}")
         return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
-    except device.TooLarge as reason:
+    except gpu.TooLarge as reason:
         # Its entries are too many operations for XLA: the function itself has fewer.
         mode.say_once(f"{program.name} runs on JAX's own operations on GPUs: {reason}")
         return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
@@ -302,8 +302,8 @@ def _lower_to_launch(ctx, *operands, program, rows, uniform):
         return lowering_of(_with_last_axis)(ctx, *operands, program=program, rows=rows and rows + 1)
     order = target.varying_first(uniform)
     attributes = _partition_attributes([ctx.avals_in[i] for i in order], ctx.avals_out)
-    layouts = device.layouts(program, uniform, [x.shape for x in (*ctx.avals_in, *ctx.avals_out)])
-    return jax_adapter.lower_call(device.TARGET, ctx, operands, order, attributes, layouts, program=number)
+    layouts = gpu.layouts(program, uniform, [x.shape for x in (*ctx.avals_in, *ctx.avals_out)])
+    return jax_adapter.lower_call(gpu.TARGET, ctx, operands, order, attributes, layouts, program=number)
 
 
 def _with_last_axis(*args, program, rows):

@@ -67,7 +67,7 @@ class Program:
     - `fast`, `careful`: None, or the two programs of a pair (see `careful`); `operations` are those of both.
     """
 
-    # Repetitions of the operations in one call, by which the cost of a `loops.Loop` is estimated.
+    # Repetitions of the operations in one call, by which the cost of a `kernels.Loop` is estimated.
     turns = 1
     is_called = False  # whether it has loops, so that other programs can only call it
 
@@ -268,3 +268,12 @@ def as_objects(x) -> np.ndarray:
 
 
 _OF_PYTHON = (np.dtype(np.float64), np.dtype(bool))
+
+
+def split_by_counts(values: Sequence, counts: Sequence[int]) -> tuple:
+    """Consecutive parts of these lengths."""
+    at, parts = 0, []
+    for count in counts:
+        parts.append(tuple(values[at : at + count]))
+        at += count
+    return tuple(parts)

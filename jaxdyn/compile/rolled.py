@@ -22,8 +22,9 @@ from jaxdyn.compile.program import (
     is_number,
     kind_or_refuse,
     objects,
+    split_by_counts,
 )
-from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan, split_by_counts
+from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan
 
 # Operations of an iteration beyond which there is no loop, but of a sweep.
 MAX_LOOP_BODY = 20_000

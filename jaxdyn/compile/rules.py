@@ -34,12 +34,7 @@ def _define_flagged(name: str, **lowering) -> Any:
         return [None, cotangent if is_zero(cotangent) else primitive.bind(flag, cotangent)]
 
     primitive = define_primitive(
-        name,
-        lambda flag, x: ShapedArray(x.shape, x.dtype),
-        batch=batch,
-        jvp=jvp,
-        transpose=transpose,
-        **lowering,
+        name, lambda flag, x: ShapedArray(x.shape, x.dtype), batch=batch, jvp=jvp, transpose=transpose, **lowering
     )
     return primitive
 

@@ -22,9 +22,9 @@ import numpy as np
 from jaxdyn.compile import derive
 from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.code import ATTRIBUTES, ScanText
+from jaxdyn.compile.derive import arrays_of, replay
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import arrays_of, replay
-from jaxdyn.compile.program import Array, Constant, Program, as_objects, derived, is_number
+from jaxdyn.compile.program import Array, Constant, Program, as_objects, derived, is_number, split_by_counts
 
 # Operations beyond which a loop is not written out. LLVM takes some 50 microseconds for each: one second.
 MAX_WRITTEN_OUT = 20_000
@@ -353,15 +353,6 @@ def is_chain(parents) -> bool:
 def rows_of_array(array: Array, length: int) -> Array:
     """The array of all rows."""
     return Array((length, *array.shape), array.dtype)
-
-
-def split_by_counts(values: Sequence, counts: Sequence[int]) -> tuple:
-    """Consecutive parts of these lengths."""
-    at, parts = 0, []
-    for count in counts:
-        parts.append(tuple(values[at : at + count]))
-        at += count
-    return tuple(parts)
 
 
 def where_flag(values: Sequence, flags: Sequence[bool], which: bool = True) -> list:

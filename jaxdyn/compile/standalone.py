@@ -17,13 +17,13 @@ import numpy as np
 from jaxdyn.compile import derive
 from jaxdyn.compile.body import Body, symbol_of
 from jaxdyn.compile.code import ATTRIBUTES
+from jaxdyn.compile.derive import inline, replay
 from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.mode import careful, remedy_of, standalone
-from jaxdyn.compile.objects import features as host_features
 from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of, objects
+from jaxdyn.compile.stored import features as host_features
 from jaxdyn.compile.trace import program_of
 
 # Operations of a directional derivative times the number of directions. A Panda's forward dynamics has 63 000: by columns its

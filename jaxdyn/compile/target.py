@@ -12,17 +12,15 @@ from typing import Any, NamedTuple
 import llvmlite.binding as llvm
 import numpy as np
 
-from jaxdyn.compile import disk, first_calls, objects
+from jaxdyn.compile import disk, mode, stored
 from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.careful import CAREFUL, Careful, identity_of, number_of, run_apart
-from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, varying_first
-from jaxdyn.compile.first_calls import optimise_later, phase
+from jaxdyn.compile.code import calls_itself, has_table, kernel_ir, subprogram_ir, varying_first
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
-from jaxdyn.compile.listing import has_table
-from jaxdyn.compile.objects import Code, features
+from jaxdyn.compile.mode import optimise_later, phase
 from jaxdyn.compile.program import FLOATS, Program, kind_of
-from jaxdyn.compile.stored import error_of_retrace
+from jaxdyn.compile.stored import Code, error_of_retrace, features
 
 TARGET = "jaxdyn_kernel"
 SLOTS = 1 << 16
@@ -77,9 +75,9 @@ def register() -> None:
 
 @functools.cache  # which does not keep two threads from a first call at once
 def _register() -> None:
-    code = objects.code_of(fill_handler("jaxdyn_table", _table))
+    code = stored.code_of(fill_handler("jaxdyn_table", _table))
     register_handler(TARGET, code.address("handler"))
-    objects.add_symbol(CAREFUL, code.address("careful"))
+    stored.add_symbol(CAREFUL, code.address("careful"))
     _codes.append(code)
 
 
@@ -100,8 +98,8 @@ def fill_handler(name: str, table: ctypes.Array) -> str:
         text = text.replace("{" + field + "}", str(value))
     # Places of this process have names in the text, so that its code is found on disk.
     for symbol, place in ((name, table), ("jaxdyn_limit", _threads), ("jaxdyn_failures", _failures)):
-        objects.add_symbol(symbol, ctypes.addressof(place))
-    objects.add_symbol("jaxdyn_prepare", ctypes.cast(_prepare, ctypes.c_void_p).value or 0)
+        stored.add_symbol(symbol, ctypes.addressof(place))
+    stored.add_symbol("jaxdyn_prepare", ctypes.cast(_prepare, ctypes.c_void_p).value or 0)
     return text
 
 
@@ -200,7 +198,7 @@ def free_entry(table: ctypes.Array, number: int) -> Entry:
 
 
 class _Called(NamedTuple):
-    """The place in memory of a subprogram's address, and what it calls (see `objects.ObjectFile`)."""
+    """The place in memory of a subprogram's address, and what it calls (see `stored.ObjectFile`)."""
 
     address: ctypes.c_uint64
     calls: tuple[str, ...]
@@ -220,7 +218,7 @@ class _Kernel:
         self.careful: Careful | None = None
         self.recover: Callable | None = None  # makes the program again, of a kernel that was read from disk
         self.is_made = False
-        self.is_awaited = False  # whether a worker is to compile it (see `first_calls`)
+        self.is_awaited = False  # whether a worker is to compile it (see `mode`)
         self.sizes = (ctypes.c_int64 * len(row.sizes))(*row.sizes)
         self.entry = free_entry(_table, number)
         self.entry.kernel, self.entry.chunk, self.entry.least = 0, row.chunk, 2 * row.chunk
@@ -243,7 +241,7 @@ class _Kernel:
         if row.careful is None:
             return self._make_of(self.program, row.identity)
         # A careful program is traced only where its code is not on disk.
-        file = objects.name_of_file(f"careful {row.careful}")
+        file = stored.name_of_file(f"careful {row.careful}")
         known = disk.read(file) if row.is_kept else None
         if known is not None and self._make_of(None, known.decode()):
             return True
@@ -258,13 +256,13 @@ class _Kernel:
 
     def _make_of(self, program, identity: str) -> bool:
         # Before the lock is taken: programs that are traced again compile kernels too.
-        if program is not None and objects.find(identity) is None:
+        if program is not None and stored.find_code(identity) is None:
             _read_operations(program)
         with phase("LLVM"), _making:
             return self.is_made or self._make(program, identity)
 
     def _make(self, program, identity: str) -> bool:
-        width, found, is_new = self.row.width, objects.find(identity), False
+        width, found, is_new = self.row.width, stored.find_code(identity), False
         if found is None and program is None:
             return False
         calls, careful = _calls(_subprograms_of_kernel(program, width), width)
@@ -279,7 +277,7 @@ class _Kernel:
             quick_width = 0 if program.turns > 1 and width > 1 else width
             is_call = is_program and calls_itself(program, width)
             quick = None if is_call else _write_quick(program, quick_width, write)
-            found = objects.make(identity, write, tuple(calls), careful, program.name, quick_width, quick)
+            found = stored.make_code(identity, write, tuple(calls), careful, program.name, quick_width, quick)
             is_new = True
         _install(found, identity, "kernel", partial(setattr, self.entry, "kernel"), is_new)
         self.is_made, self.program = True, None  # a program of a large robot takes megabytes
@@ -355,7 +353,7 @@ def make_ahead(number: int) -> None:
     made = _kernels[number]
     if not made.is_made and not made.is_awaited:
         made.is_awaited = True
-        first_calls.make_later(made.address)
+        mode.make_later(made.address)
 
 
 def publish_ahead(program, width: int) -> None:
@@ -370,7 +368,7 @@ def publish_ahead(program, width: int) -> None:
                 with phase("LLVM"), _making:
                     _publish(symbol, width, calls)
 
-        first_calls.make_later(make)
+        mode.make_later(make)
 
 
 def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callable | None = None) -> bool:
@@ -379,7 +377,7 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
     `recover()`: makes careful programs that it calls, should it be found and they be needed.
     """
     called, known, is_new = programs.get(symbol), _called.get(symbol), False
-    found = objects.find(symbol) if known is None else known
+    found = stored.find_code(symbol) if known is None else known
     if called is None and found is None:
         return False
     calls, careful = _calls(() if called is None else called.subprograms, width)
@@ -389,36 +387,36 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
             return False
     if known is not None:
         return True
-    if not isinstance(found, objects.ObjectFile):
+    if not isinstance(found, stored.ObjectFile):
         assert called is not None
         is_program = isinstance(called, Program)
         write = partial(subprogram_ir, called, width) if is_program else partial(called.subprogram_ir, width)
         quick = _write_quick(called, width, write)
-        found = objects.make(symbol, write, tuple(calls), careful, called.name, width, quick)
+        found = stored.make_code(symbol, write, tuple(calls), careful, called.name, width, quick)
         is_new = True
     _called[symbol] = _Called(ctypes.c_uint64(), found.calls, found.careful)
     _install(found, symbol, "called", partial(setattr, _called[symbol].address, "value"), is_new)
-    objects.add_symbol(f"{symbol}_at", ctypes.addressof(_called[symbol].address))
+    stored.add_symbol(f"{symbol}_at", ctypes.addressof(_called[symbol].address))
     return True
 
 
 def _write_quick(program, width: int, write: Callable) -> Callable[[], str] | None:
     """What writes the text of a large program as a listing, write(is_quick=True); None for others."""
     program = getattr(program, "turn", program)
-    if not (width and objects.has_two_levels() and isinstance(program, Program)):
+    if not (width and stored.has_two_levels() and isinstance(program, Program)):
         return None
     program = program.fast or program
     return partial(write, is_quick=True) if has_table(program, True) and not has_table(program) else None
 
 
 def _install(
-    found: objects.ObjectFile, identity: str, name: str, enter: Callable[[int], None], is_new: bool = False
+    found: stored.ObjectFile, identity: str, name: str, enter: Callable[[int], None], is_new: bool = False
 ) -> None:
     """Load code and enter the address of its function; quick code is replaced later, and stays for those who run it."""
     code = Code(found.binary)
     _codes.append(code)
     enter(code.address(name))
-    if found.text and objects.has_two_levels():
+    if found.text and stored.has_two_levels():
         improve, keep = lambda: _install(found.improve(identity), identity, name, enter), partial(found.keep, identity)
         optimise_later(improve, keep, len(found.binary), is_new)
 

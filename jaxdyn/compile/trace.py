@@ -15,8 +15,8 @@ import numpy as np
 from jaxdyn.compile import jax_adapter, mode, stored
 from jaxdyn.compile.careful import Careful, digest_of, guard
 from jaxdyn.compile.expansion import expand
-from jaxdyn.compile.first_calls import phase
 from jaxdyn.compile.known import Known, partition_tracers
+from jaxdyn.compile.mode import phase
 from jaxdyn.compile.program import Array, NotNumbers, Program, TooLong
 from jaxdyn.compile.rules import change_along, guarded_p, has_marks
 

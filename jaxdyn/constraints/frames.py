@@ -178,20 +178,15 @@ def _group_rows(members: tuple[Pair, ...], system, q, v) -> list:
     return motions
 
 
-def _few_columns(left, subspace, mask: np.ndarray):
-    """`_masked_columns` by those columns alone that the mask leaves: of a large mechanism they are few."""
+def _masked_columns(left, subspace, mask: np.ndarray):
+    """Products (n, r, nv) of left (n, r, 6) with the screws (nv, 6) of the coordinates, zero where not mask (n, nv)."""
+    # By those columns alone that the mask leaves: of a large mechanism they are few.
     count = mask.sum(1).max()
     index = np.argsort(~mask, axis=1, kind="stable")[:, :count]
     product = matmul(left, jnp.swapaxes(subspace[index], 1, 2))
     product = product * jnp.asarray(np.take_along_axis(mask, index, 1)[:, None, :], left.dtype)
     rows, zero = np.ogrid[: left.shape[0], : left.shape[1], :1], jnp.zeros((*left.shape[:2], len(subspace)), left.dtype)
     return zero.at[rows[0], rows[1], index[:, None, :]].set(product)
-
-
-@variant(_few_columns)
-def _masked_columns(left, subspace, mask: np.ndarray):
-    """Products (n, r, nv) of left (n, r, 6) with the screws (nv, 6) of the coordinates, zero where not mask (n, nv)."""
-    return matmul(left, subspace.T) * jnp.asarray(mask[:, None, :], left.dtype)
 
 
 # Traced once for all calls of a program: a step with projections has many of them. Not in kernels, where a nested `jit` would

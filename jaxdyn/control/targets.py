@@ -28,8 +28,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxdyn.compile.kernels import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.compile.known import is_concrete, is_known, stop_gradient
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.constraints.assembly import closing_tolerance
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.frames import Pair

@@ -2,8 +2,9 @@
 
 The pose of body i is T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of
 exponentials of Murray, Li & Sastry (1994), eq. 3.3, with body frames instead of base-frame screws. The product along
-the tree is taken by pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth)
-batched 4x4 products give all poses and the program stays short however many bodies there are.
+the tree is one for each body, in native code a loop over them where they are many. Arrays of many bodies are multiplied by
+pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth) batched 4x4 products give
+all poses.
 
 Quantities summed over bodies are expressed in one *tree frame*: axes parallel to the world's, origin at the origin of
 the tree's root body. Positions in it are built without ever adding the root's own position, so a robot far from the
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import sweep, variant
+from jaxdyn.compile import sweep
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.topology import KINDS, SCREW_KINDS, joint_transform, screw_transform
@@ -131,47 +132,49 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     return TreeFrame(pose, origin, subspace)
 
 
-@variant(lambda count: count >= MIN_BODIES_IN_LOOPS)
-def _has_loops(count: int) -> bool:
-    """Decide whether a kernel is traced and so many bodies are loops in it, whose code does not grow with their number."""
-    del count
-    return False
-
-
 def map_rows(function: Callable, *rows):
     """Evaluate function(row of each array) for all rows of arrays (n, ...), one for each body or coordinate."""
-    if not _has_loops(len(rows[0])):
-        return jax.vmap(function)(*rows)
+    count, at_once = len(rows[0]), jax.vmap(function)
+    if count < MIN_BODIES_IN_LOOPS:
+        return at_once(*rows)
+
+    def step(carry, row):
+        return carry, function(*row)
+
     # A chain without a carry.
-    return sweep(lambda carry, row: (carry, function(*row)), range(-1, len(rows[0]) - 1), (), rows)[1]
+    return sweep(step, range(-1, count - 1), (), rows, by_arrays=lambda: ((), at_once(*rows)))[1]
 
 
-def _accumulate(topology: Topology, combine: Callable, start, rows, inward: bool = False):
-    """For each body combine(that of its parent, or the sum over its children, own row), by a loop."""
-    return sweep(lambda x, own: (combine(x, own),) * 2, topology.parents, start, rows, inward=inward)[1]
+def _accumulate(topology: Topology, combine: Callable, start, rows, by_arrays: Callable, inward: bool = False):
+    """For each body combine(that of its parent, or the sum over its children, own row), by a loop where bodies are many."""
+    if topology.nb < MIN_BODIES_IN_LOOPS:
+        return by_arrays()
+
+    def step(x, own):
+        return (combine(x, own),) * 2
+
+    return sweep(step, topology.parents, start, rows, inward=inward, by_arrays=lambda: (None, by_arrays()))[1]
 
 
-def _products_in_order(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
-    """`_tree_products` with one product per body: in a kernel pointer jumping would multiply the operations by log2(depth)."""
-    if _has_loops(topology.nb):
-        return _accumulate(topology, matmul, jnp.eye(4, dtype=pose.dtype), pose)
-    products: list = []
-    for i, parent in enumerate(topology.parents):
-        products.append(pose[i] if parent < 0 else matmul(products[parent], pose[i]))
-    return jnp.stack(products) if products else pose
-
-
-@variant(_products_in_order)
 def _tree_products(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
-    """Products of the poses of all bodies above each body, root first.
+    """Products of the poses of all bodies above each body, root first."""
+    if topology.nb < MIN_BODIES_IN_LOOPS:
+        # One for each body: pointer jumping would multiply the operations by log2(depth).
+        products: list = []
+        for i, parent in enumerate(topology.parents):
+            products.append(pose[i] if parent < 0 else matmul(products[parent], pose[i]))
+        return jnp.stack(products) if products else pose
+    one = jnp.eye(4, dtype=pose.dtype)
 
-    By pointer jumping, with log2(depth) products of all bodies.
-    """
-    # The extra row is the world: a jump beyond the root multiplies by the identity.
-    world = jnp.eye(4, dtype=pose.dtype)[None]
-    for table in topology.jumps:
-        pose = matmul(jnp.concatenate([pose, world])[table], pose)
-    return pose
+    def by_jumps():
+        """Products by pointer jumping, log2(depth) of all bodies."""
+        made = pose
+        # The extra row is the world: a jump beyond the root multiplies by the identity.
+        for table in topology.jumps:
+            made = matmul(jnp.concatenate([made, one[None]])[table], made)
+        return made
+
+    return _accumulate(topology, matmul, one, pose, by_jumps)
 
 
 def body_twists(model: Model, frame: TreeFrame, v: Float[Array, " nv"]) -> Float[Array, "nb 6"]:
@@ -186,20 +189,25 @@ def subspace_rate(model: Model, frame: TreeFrame, twists: Float[Array, "nb 6"]) 
 
 def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
     """G rows: for each body the sum of the rows of the coordinates that move it."""
-    topology = model.topology
-    if not _has_loops(topology.nb):
-        return matmul(jnp.asarray(topology.dof_ancestors, rows.dtype), rows)
-    if topology.nv > topology.nb:  # of joints with several coordinates the sum over these
+    topology, of_coordinates = model.topology, rows
+    if topology.nv > topology.nb >= MIN_BODIES_IN_LOOPS:  # of joints with several coordinates the sum over these
         rows = matmul(jnp.asarray(np.arange(topology.nb)[:, None] == topology.dof_body, rows.dtype), rows)
-    return _accumulate(topology, jnp.add, jnp.zeros_like(rows[0]), rows)
+
+    def by_arrays():
+        return matmul(jnp.asarray(topology.dof_ancestors, rows.dtype), of_coordinates)
+
+    return _accumulate(topology, jnp.add, jnp.zeros_like(rows[0]), rows, by_arrays)
 
 
 def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
     """G^T rows: for each velocity coordinate the sum of the rows of the bodies that it moves."""
     topology = model.topology
-    if not _has_loops(topology.nb):
-        return matmul(jnp.asarray(topology.dof_ancestors.T, rows.dtype), rows)
-    return take(_accumulate(topology, jnp.add, jnp.zeros_like(rows[0]), rows, inward=True), topology.dof_body)
+
+    def by_arrays():
+        return matmul(jnp.asarray(topology.ancestors.T, rows.dtype), rows)
+
+    sums = _accumulate(topology, jnp.add, jnp.zeros_like(rows[0]), rows, by_arrays, inward=True)
+    return take(sums, topology.dof_body)
 
 
 def take(rows: Array, index: np.ndarray) -> Array:

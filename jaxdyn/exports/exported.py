@@ -12,11 +12,11 @@ from jaxtyping import PyTree
 
 from jaxdyn.compile import standalone
 from jaxdyn.compile.directions import Directions
-from jaxdyn.compile.objects import Code, code_of
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.standalone import DEGENERATE, Routine
 from jaxdyn.compile.standalone import HOST as HOST
 from jaxdyn.compile.standalone import TARGETS as TARGETS
+from jaxdyn.compile.stored import Code, code_of
 from jaxdyn.exports.files import write_files
 from jaxdyn.exports.interfaces import (
     Argument,

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn.compile import variant
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, store_leaf, warn
@@ -275,35 +274,25 @@ def nearest_rotation(rotation: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]
     return jnp.einsum("...ij,...jk->...ik", rotation, 1.5 * one - 0.5 * gram)
 
 
-def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+    """Home poses (nb, 4, 4) and screws (nb, 6) as every algorithm uses them.
+
+    Values are those of the leaves; screw entries that the joint's kind does not have are zero. Entries of a known model within
+    rounding of 0, 1 or -1 are exact, so that they cost no operation of a kernel. Derivatives are made unique: a change of a home
+    pose that leaves SE(3) has no meaning, and algorithms would give different derivatives for it. It is projected onto SE(3) by
+    R (3 - R^T R)/2, which equals R for a rotation and whose derivative is the projection.
+    """
     mask = model.topology.screw_mask
+    # A known home pose is not differentiated, so that the projection would only add rounding.
+    if is_concrete(model.home, model.screws):
+        return _snap_to_integers(model.home), _snap_to_integers(model.screws) * mask.astype(model.screws.dtype)
     # A revolute joint of a declared kind ignores v, so that its derivative with respect to v is zero too.
     screws = model.screws * jnp.asarray(mask, model.screws.dtype)
-    # A known home pose is not differentiated, so that the projection would only add rounding.
     if is_concrete(model.home):
         return model.home, screws
     rotation = nearest_rotation(model.home[:, :3, :3])
     last = jnp.broadcast_to(jnp.asarray(np.eye(4)[3:], rotation.dtype), (model.nb, 1, 4))
     return jnp.concatenate([jnp.concatenate([rotation, model.home[:, :3, 3:]], 2), last], 1), screws
-
-
-def _geometry_in_kernel(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """`_geometry` in a kernel: entries of a known model within rounding of 0, 1 or -1 become exact, and cost no operation."""
-    if not is_concrete(model.home, model.screws):
-        return _geometry(model)
-    screws = _snap_to_integers(model.screws) * model.topology.screw_mask.astype(model.screws.dtype)
-    return jnp.asarray(_snap_to_integers(model.home)), jnp.asarray(screws)
-
-
-@variant(_geometry_in_kernel)
-def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """Home poses (nb, 4, 4) and screws (nb, 6) as every algorithm uses them.
-
-    Values are those of the leaves; screw entries that the joint's kind does not have are zero. Derivatives are made unique:
-    a change of a home pose that leaves SE(3) has no meaning, and algorithms would give different derivatives for it. It is
-    projected onto SE(3) by R (3 - R^T R)/2, which equals R for a rotation and whose derivative is the projection.
-    """
-    return _geometry(model)
 
 
 def _snap_to_integers(leaf) -> np.ndarray:

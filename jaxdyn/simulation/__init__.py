@@ -1,8 +1,7 @@
 """Simulation of scenes; the only subpackage that integrates.
 
 `run` is `jd.simulate`, `methods` are the differential equations of a scene, `solvers/` the methods of diffrax and of our own,
-`hybrid/` motion with events, `variational` steps for long motions, `stiffness` the rates of a scene. Imports `reduction`,
-`constraints` and what is below them.
+`hybrid/` motion with events, `variational` steps for long motions. Imports `reduction`, `constraints` and what is below them.
 """
 
 import importlib
@@ -14,16 +13,9 @@ if TYPE_CHECKING:
     from jaxdyn.simulation.methods import Baumgarte as Baumgarte
     from jaxdyn.simulation.options import Pose as Pose
     from jaxdyn.simulation.options import Steps as Steps
-    from jaxdyn.simulation.stiffness import Stiffness as Stiffness
+    from jaxdyn.simulation.solvers.choice import Stiffness as Stiffness
 
-__all__ = [
-    "Baumgarte",
-    "ContactStep",
-    "JointLimitWarning",
-    "Pose",
-    "Steps",
-    "Stiffness",
-]
+__all__ = ["Baumgarte", "ContactStep", "JointLimitWarning", "Pose", "Steps", "Stiffness"]
 
 
 def __dir__() -> list[str]:
@@ -39,7 +31,7 @@ def __getattr__(name: str) -> Any:
         "JointLimitWarning": "events",
         "Pose": "options",
         "Steps": "options",
-        "Stiffness": "stiffness",
+        "Stiffness": "solvers.choice",
     }
     if name not in homes:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -114,7 +114,7 @@ def contact_step(contacts: Contacts, scene: Scene, q, v, z, tau, t, h, smoothing
     if contacts.limited:
         limit_forces = limit_forces.at[np.array([k for _, k in contacts.limited])].add(forces[start:])
     by_name = {one.name: by_name[one.name] for one in contacts.elements}
-    return tuple(state), ContactStep(by_name, limit_forces, result, found.residual)
+    return tuple(state), ContactStep(forces=by_name, limit_forces=limit_forces, result=result, residual=found.residual)
 
 
 def mean_of_steps(steps: ContactStep) -> ContactStep:
@@ -122,7 +122,7 @@ def mean_of_steps(steps: ContactStep) -> ContactStep:
     forces, limit_forces = jax.tree.map(lambda x: jnp.mean(x, 0), (steps.forces, steps.limit_forces))
     codes = steps.result.index
     first = codes[jnp.argmax(codes != RESULTS.successful.index)]
-    return ContactStep(forces, limit_forces, Result(first), jnp.max(steps.residual))
+    return ContactStep(forces=forces, limit_forces=limit_forces, result=Result(first), residual=jnp.max(steps.residual))
 
 
 def _advance(contacts: Contacts, scene: Scene, *state) -> _Step:

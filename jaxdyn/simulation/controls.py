@@ -6,7 +6,7 @@ A plain control is tau(q, v, t). A `Controller` also has a state z, integrated w
 
 The constraint forces lam depend on tau. If they are fed back through z there is no algebraic loop, because tau depends on z and
 not on lam. If tau depends on lam directly, lam = lam(tau(lam)) has to be solved. The dynamics are affine in tau, so that this is
-a linear equation if the law is affine in lam (`_solve_affine_loop`). A `Sampled` law is called once per period, and its torque is
+a linear equation if the law is affine in lam (see `torque`). A `Sampled` law is called once per period, and its torque is
 held in between.
 
 The state of the differential equation (`Method`) is a dictionary. A control adds "control", the state z as a vector, or "held",
@@ -247,18 +247,13 @@ def torque(control: Control, scene: Scene, y, q, v, t, multipliers: Callable) ->
     def torque_of(lam):
         return check_force(control(q, v, t, state, lam), q, scene.nv, "control")
 
+    # lam = f(lam) for an affine f: f(lam) = f(0) + F lam, so (1 - F) lam = f(0). Redundant rows can make 1 - F singular. Any
+    # solution will do, and the pseudo-inverse chooses the shortest.
     zero = jnp.zeros((_row_count(scene),), q.dtype)
-    return torque_of(_solve_affine_loop(lambda lam: multipliers(torque_of(lam)), zero))
-
-
-def _solve_affine_loop(function: Callable, zero: Float[Array, " nc"]) -> Float[Array, " nc"]:
-    """Solution of lam = f(lam) for an affine function f; `zero` is its argument at the origin."""
-    # f(lam) = f(0) + F lam, so (1 - F) lam = f(0). Redundant rows can make 1 - F singular. Any solution will do, and
-    # the pseudo-inverse chooses the shortest.
-    at_zero, apply_F = jax.linearize(function, zero)
+    at_zero, apply_F = jax.linearize(lambda lam: multipliers(torque_of(lam)), zero)
     identity = jnp.eye(zero.shape[0], dtype=zero.dtype)
     matrix = identity - jax.vmap(apply_F, out_axes=1)(identity)
-    return matmul(pseudo_inverse(matrix, tolerance(None, matrix)), at_zero)
+    return torque_of(matmul(pseudo_inverse(matrix, tolerance(None, matrix)), at_zero))
 
 
 def rates(control: Any, y, q, v, t, multipliers: Callable) -> dict[str, Array]:
@@ -282,7 +277,7 @@ def state_of(control: Any, y, q, v, t) -> Any:
 
 
 def at_start(control: Control, q, v, t) -> Any:
-    """Control as a function (q, v, t) -> tau for a linearisation at this state (`find_stiffness`).
+    """Control as a function (q, v, t) -> tau for a linearisation at this state (`stiff_rates`).
 
     The state of a controller is held at the value with which a run from here would start. None where tau is no function of
     (q, v, t): for a sampled law, and for a law that uses the multipliers.

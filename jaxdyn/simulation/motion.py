@@ -1,12 +1,14 @@
 """Motion without modes: projection of the start, integration, terminal events, the result code, and the outputs."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel
@@ -17,22 +19,28 @@ from jaxdyn.constraints.rank import LEAST_GAP
 from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, rows_of
 from jaxdyn.constraints.selection import most_rounding, select_rows
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.checks import (
-    Inputs,
-    angle_coordinates,
-    has_definite_mass,
-    largest_angle,
-    safe_inputs,
-)
-from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, at_save_point, equations
+from jaxdyn.simulation.checks import Inputs, angle_coordinates, has_definite_mass, largest_angle, safe_inputs
+from jaxdyn.simulation.equations import DRIVES, KEPT, WITHIN, Equations, at_save_point, equations
 from jaxdyn.simulation.events import Conditions, Violation, first_violation
-from jaxdyn.simulation.integration import integrate
-from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
+from jaxdyn.simulation.methods import Method, Reduced, consistent, is_regular, satisfies_redundant_rows, start_limit
 from jaxdyn.simulation.options import Options, is_backsolve, is_step_length
-from jaxdyn.simulation.solution import RESULTS, Solution, invalidate_failures, rows_where
-from jaxdyn.simulation.solvers import LieGroup, Stepper
-from jaxdyn.simulation.solvers.choice import choose_adjoint, choose_solver, is_split, label
-from jaxdyn.simulation.solvers.integrator import COUNTS
+from jaxdyn.simulation.solution import RESULTS, Solution, from_diffrax, invalidate_failures, rows_where
+from jaxdyn.simulation.solvers import LibrarySteps, LieGroup, ProjectedSolver, Stepper
+from jaxdyn.simulation.solvers.base import Adaptive, ErrorMonitoredSteps, too_coarse
+from jaxdyn.simulation.solvers.choice import (
+    choose_adjoint,
+    choose_loop,
+    choose_solver,
+    has_own_loop,
+    is_split,
+    label,
+    progress_meter,
+    solver_and_control,
+)
+from jaxdyn.simulation.solvers.diffrax_loop import DiffraxRun, GuardedSolver, event_of, run, run_adaptively
+from jaxdyn.simulation.solvers.driver import COUNTS, ROOM, LibraryRun, step_control
+from jaxdyn.simulation.solvers.guards import SEARCH_STEPS, delay
+from jaxdyn.simulation.solvers.steps import Plan
 from jaxdyn.systems.scene import Scene, check_callback
 from jaxdyn.systems.system import displace, has_dependent_coordinates
 
@@ -173,7 +181,12 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
     conditions = Conditions(at_contacts, at_limits, controls.can_end(control, *start), len(options.terminals))
     for one in options.terminals:
         check_callback(one.function, "Terminal: function", "function(q, v, t)", *start)
-    _check_conditions(conditions, options.adjoint)
+    if any(conditions) and is_backsolve(options.adjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which does not go back through events, and contacts, limits, a terminal event or the "
+            "control may end the run; take 'reverse', or jd.events.ContactLost(stop=False), no other events and a control "
+            "without `allowance`"
+        )
     eqs, args = equations(scene, control, method, entries, *start, conditions, options.terminals)
     # Shapes that do not fit are reported here, with the user's function at the end of the traceback.
     eqx.filter_eval_shape(eqs.generalized_force, args, entries, *start)
@@ -182,16 +195,6 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
         y0 = y0 | {KEPT: rows_of(scene, start[0].dtype)}
     y0 = y0 | {"work": jnp.zeros((), start[0].dtype)} if "work" in options.outputs else y0
     return _Run(scene, control, method, eqs, args), y0
-
-
-def _check_conditions(conditions: Conditions, adjoint) -> None:
-    """Refuse an adjoint that does not go back through the event that may end a run."""
-    if any(conditions) and is_backsolve(adjoint):
-        raise ValueError(
-            "adjoint is 'backsolve', which does not go back through events, and contacts, limits, a terminal event or the "
-            "control may end the run; take 'reverse', or jd.events.ContactLost(stop=False), no other events and a control "
-            "without `allowance`"
-        )
 
 
 def _solver(run: _Run, y0, solver):
@@ -271,3 +274,145 @@ def _redundancy(run: _Run, y, q, ts, reached) -> dict[str, Array]:
         # Rows that were not reached hold the start, and are none of the motion's.
         "redundant_gap": jnp.max(jnp.where(reached, gaps, jnp.zeros_like(gaps))),
     }
+
+
+# --- integration from the start to the save points: the solver, the loop (our own or diffrax's), and the code at the end ---
+
+
+class Outcome(NamedTuple):
+    """Rows of the state at ts[1:], a code, counts, the time reached, and the state there if an event may end the run."""
+
+    rows: Any
+    result: Any
+    counts: dict[str, Any]
+    time_reached: Any
+    last: Any = None
+
+
+def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, options: Options) -> Outcome:
+    """Integrate from the start to the save points."""
+    adjoint, has_length = options.adjoint, is_step_length(steps[-1])
+    solver: Any
+    solver, controller, dt0 = solver_and_control(options.solver, term, ts, *steps)
+    # The continuous adjoint integrates another vector field backwards: projections and events of y do not apply to it.
+    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)
+    step_constants = (*method.step_constants, *({controls.HELD, KEPT} & set(y0)))
+    quality, guards = (None, None) if continuous else _monitors(eqs, method)
+    loop, reason = choose_loop(solver, controller, options, guards, quality, eqs.pieces.names)
+    if has_own_loop(solver) and not continuous:
+        solver = LibrarySteps(solver, project, step_constants, method.projects, field=term.vector_field)
+    elif project:
+        solver = ProjectedSolver(solver, project, step_constants, method.projects)
+    inputs = y0, args, ts
+    if eqs.pieces.names and loop != "pieces":
+        inputs = undifferentiable(inputs, reason)
+    if loop == "diffrax":
+        controller = diffrax.ConstantStepSize() if continuous and has_length else controller
+        if guards is not None:
+            solver = GuardedSolver(solver, guards)
+            y0 = y0 | {WITHIN: jnp.ones_like(ts[0])}
+            inputs = y0, *inputs[1:]
+        event = event_of(quality, guards, ts[0], y0, args)
+        meter = progress_meter(options.progress)
+        given = DiffraxRun(term, solver, controller, event, adjoint, options.max_steps, meter, dt0)
+        outcome = _by_diffrax(given, inputs, steps, options)
+        return outcome._replace(rows=_without_mark(outcome.rows), last=_without_mark(outcome.last))
+    if loop == "pieces":
+        return _by_pieces(solver.plan(y0), eqs, inputs, controller, steps, options)
+    plan = solver.plan(y0)._replace(quality=quality, guards=guards)
+    return _by_steps(solver, plan, controller, inputs, steps, options)
+
+
+def _monitors(eqs: Equations, method) -> tuple[Callable | None, Callable | None]:
+    """Functions (t, y, args) that end a run: the quality of a basis where it changes its sign, guards where one is negative."""
+
+    def quality(t, y, args, **_):  # diffrax passes more to the condition of an event
+        # Near a singular basis steps become short; a long one may pass it, which the sign shows.
+        value = eqs.quality(t, y, args)
+        return jnp.where(is_regular(value), value, jnp.zeros_like(value))
+
+    return quality if isinstance(method, Reduced) else None, eqs.guards if any(eqs.conditions) else None
+
+
+def _without_mark(y):
+    """State without the mark of `GuardedSolver`."""
+    return y and {name: y[name] for name in y if name != WITHIN}
+
+
+def undifferentiable(tree, reason: str):
+    """Arrays of a tree, with derivatives refused."""
+
+    @jax.custom_jvp
+    def same(leaves):
+        return leaves
+
+    @same.defjvp
+    def _(primals, tangents):
+        raise ValueError(
+            "simulate: a force of the scene has a kink or a jump (jd.forces.JointStops, jd.forces.EffortLimits, "
+            "jd.forces.SlidingFriction, another "
+            f"jd.forces.PiecewiseForce). Steps that go across it have wrong derivatives, and here they cannot end there: {reason}"
+        )
+
+    return same(tree)
+
+
+def _is_direct(adjoint) -> bool:
+    """True for derivatives in forward mode too."""
+    return isinstance(adjoint, (diffrax.ForwardMode, diffrax.DirectAdjoint))
+
+
+def _by_diffrax(given: DiffraxRun, inputs, steps, options: Options) -> Outcome:
+    """Integrate in diffrax's loop."""
+    ts = inputs[2]
+    if not is_step_length(steps[-1]):
+        rows, (result, *facts) = run_adaptively(inputs, given, options.limit_is_given)
+        return Outcome(rows, from_diffrax(result), *facts)
+    rows, (result, counts, reached, *last), solution = run(inputs, given)
+    sums = solution.controller_state[2:] if isinstance(given.controller, ErrorMonitoredSteps) else None
+    # diffrax is at the end of the step that could not be solved; what is known ends at its beginning.
+    before = ts[0] + (counts["num_steps"].astype(ts.dtype) - 1) * steps[-1]
+    result = from_diffrax(result)
+    reached = jnp.where(result == RESULTS.nonlinear_divergence, before, reached)
+    if sums is not None:
+        result = RESULTS.where((result == RESULTS.successful) & too_coarse(sums), RESULTS.coarse_steps, result)
+    return Outcome(rows, result, counts, reached, *last)
+
+
+def _by_pieces(plan: Plan, eqs: Equations, inputs, controller, steps, options: Options) -> Outcome:
+    """Integrate by steps that end at the kinks of forces."""
+    # Imported here, because most scenes have no pieces and a first call should not wait for these modules.
+    from jaxdyn.simulation.hybrid import MIN_EVENTS, PiecewiseSystem, piecewise_motion
+
+    system = PiecewiseSystem(plan, eqs.pieces, eqs.switching)
+    rtol, atol, stepsize = steps
+    (y0, args, ts), has_length = inputs, is_step_length(stepsize)
+    room, most = options.max_steps, max(MIN_EVENTS, options.max_events)
+    if not has_length:
+        rtol, atol, stepsize = controller.rtol, controller.atol, None
+        room = room if options.limit_is_given else min(room, ROOM)
+    rows, end = piecewise_motion(
+        system, y0, args, ts, rtol, atol, stepsize, options.max_steps, room, most, _is_direct(options.adjoint)
+    )
+    return Outcome(rows, end.result, end.counts, end.t)
+
+
+def _by_steps(solver: LibrarySteps, plan: Plan, controller, inputs, steps, options: Options) -> Outcome:
+    """Integrate by explicit steps in the library's own loop."""
+    # Attempts that locate the end do not count among the user's steps.
+    most = options.max_steps + (0 if plan.guards is None else 2 * SEARCH_STEPS)
+    if isinstance(controller, Adaptive):
+        room, control = (
+            most if options.limit_is_given else min(most, ROOM),
+            step_control(solver, None, controller.norm),
+        )
+        run = LibraryRun(plan, control, controller.rtol, controller.atol, None, most, room=room)
+    else:
+        run = LibraryRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], most, room=most)
+    rows, (result, counts, reached) = (run.direct if _is_direct(options.adjoint) else run)(*inputs)
+    if plan.guards is None:
+        return Outcome(rows, result, counts, reached)
+    rows, end = (jax.tree.map(lambda x, at=at: x[at], rows) for at in (slice(-1), -1))
+    args, y = inputs[1], ravel_pytree(end)[0]
+    late = delay(lambda args, t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of, args, reached, y)
+    return Outcome(rows, result, counts, reached + jnp.where(result == RESULTS.event_occurred, late, 0.0), end)

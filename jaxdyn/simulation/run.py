@@ -20,15 +20,7 @@ from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype, w
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
-from jaxdyn.simulation.events import (
-    Event,
-    Watch,
-    check_events,
-    check_terminals,
-    events_of,
-    report_limits,
-    sort_events,
-)
+from jaxdyn.simulation.events import Event, Watch, check_events, check_terminals, events_of, report_limits, sort_events
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
 from jaxdyn.simulation.options import (
     ADJOINTS,
@@ -189,7 +181,9 @@ def simulate(
         terminals=terminals,
         max_steps=step_limit(max_steps, start[-1], stepsize, options.adjoint),
         limit_is_given=max_steps is not None,
-        selects_rows=not concrete and _selects_rows(scene, method, *start),
+        # Because the start is traced, the independent rows have to be selected during the run.
+        selects_rows=not (concrete or not scene.constraints or is_concrete((scene, method, start)))
+        and (method.rank_tol is not None or may_have_redundant_rows(scene)),
     )
     dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
     # Known numbers go to the compiled program as they are: each array of JAX made before would be a transfer of its own.
@@ -221,7 +215,7 @@ def smooth_motion(*args) -> Solution:
 @entry_point
 def hybrid_motion(*args) -> Solution:
     """A run with modes."""
-    from jaxdyn.simulation.hybrid.motion import hybrid_motion
+    from jaxdyn.simulation.hybrid import hybrid_motion
 
     return hybrid_motion(*args)
 
@@ -231,19 +225,15 @@ def _check_numbers(scene: Scene, q0, v0, ts, rtol, atol, stepsize) -> tuple:
     q0, v0, ts = as_array(q0, "q0"), as_array(v0, "v0"), as_array(ts, "ts")
     checks.check_start(scene, as_numpy_if_known(q0), as_numpy_if_known(v0))
     checks.check_times(as_numpy_if_known(ts))
-    rtol, atol = (_tolerance(name, value) for name, value in (("rtol", rtol), ("atol", atol)))
-    return (q0, v0, ts, rtol, atol), as_array(stepsize, "stepsize") if is_step_length(stepsize) else stepsize
+    tolerances = []
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        tolerances.append(_DEFAULT_TOLERANCE if value is None else as_array(value, name))
+        if value is not None:
+            check_tolerance(name, tolerances[-1])
+    return (q0, v0, ts, *tolerances), as_array(stepsize, "stepsize") if is_step_length(stepsize) else stepsize
 
 
 _DEFAULT_TOLERANCE = np.asarray(1e-8)
-
-
-def _tolerance(name: str, value):
-    if value is None:
-        return _DEFAULT_TOLERANCE
-    value = as_array(value, name)
-    check_tolerance(name, value)
-    return value
 
 
 def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool, concrete: bool) -> tuple[Scene, Method]:
@@ -276,10 +266,13 @@ def _solver_at_start(scene: Scene, control, solver, stepsize, adjoint, arrays, m
     # Only for adaptive steps without modes: events are located within explicit steps. Backwards the equations are others.
     if solver is not None or not scene.forces or modal or is_step_length(stepsize) or is_backsolve(adjoint):
         return solver
-    from jaxdyn.simulation.solvers.choice import solver_for_start
+    from jaxdyn.simulation.solvers.choice import Rodas5P, stiff_rates
 
     q0, v0, ts, *_ = arrays
-    return solver_for_start(scene, controls.at_start(control, q0, v0, ts[0]), q0, v0, ts)
+    law = controls.at_start(control, q0, v0, ts[0])
+    if not is_known(scene, law, q0, v0, ts) or stiff_rates(scene, q0, v0, ts[0], law, float(ts[-1] - ts[0])) is None:
+        return None
+    return Rodas5P()
 
 
 @once
@@ -315,10 +308,3 @@ def _choose(
     stops = at_contacts, watch.limits is not None and watch.limits.stop
     checks_mass, shows_progress = may_have_singular_mass(scene.system), watch.progress is not None
     return Options(solver, adjoint, outputs, stops, watch.max_events, shows_progress, checks_mass)
-
-
-def _selects_rows(scene: Scene, method: Method, q0, v0, ts) -> bool:
-    """True if the independent rows have to be selected during the run, because the start is traced."""
-    if not scene.constraints or is_concrete((scene, method, q0, v0, ts)):
-        return False
-    return method.rank_tol is not None or may_have_redundant_rows(scene)

@@ -217,24 +217,21 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     )
 
 
-def _is_explicit(solver) -> bool:
-    import diffrax
-
-    from jaxdyn.simulation.solvers.choice import innermost
-
-    return solver is None or isinstance(innermost(solver), diffrax.AbstractERK)  # those by default are explicit
-
-
 def _advice(name: str, solution: Solution, scene: Scene, control, options) -> str:
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options._asdict())
     # The scene may have become stiff on the way, so that the choice of the solver at the start has not seen it.
-    if name == "max_steps_reached" and _is_explicit(options.solver):
-        from jaxdyn.simulation.solvers.choice import find_stiffness, is_stiff
+    if name == "max_steps_reached":
+        import diffrax
+
+        from jaxdyn.simulation.solvers.choice import innermost, stiff_rates
 
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
         state = solution.q[last], solution.v[last], solution.ts[last]
-        rates = find_stiffness(scene, *state, at_start(control, *state))
-        if rates is not None and is_stiff(rates, float(solution.ts[-1]) - float(solution.ts[0])):
+        span = float(solution.ts[-1]) - float(solution.ts[0])
+        # Solvers by default are explicit.
+        is_explicit = options.solver is None or isinstance(innermost(options.solver), diffrax.AbstractERK)
+        rates = stiff_rates(scene, *state, at_start(control, *state), span) if is_explicit else None
+        if rates is not None:
             advice = (
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
                 f"{float(rates.explicit_step):.3g} s; pass solver=jd.solvers.Rodas5P(), or "
@@ -282,7 +279,7 @@ def signals_as_given(solution: Solution, scene: SceneLike) -> list[Signal]:
             f"{scene.nv}; pass the scene that was simulated"
         )
     names = columns_of(scene.system)
-    rows = _row_names(scene)
+    rows = tuple(f"{x.name}.{k - x.start + 1}" for x in layout(scene) for k in range(x.start, x.end))
     both = ("position", "velocity")
     columns = [
         ("q", solution.q, names.q, names.q_units),
@@ -300,12 +297,6 @@ def signals_as_given(solution: Solution, scene: SceneLike) -> list[Signal]:
         columns.append((f"contact_force_{name}", values, parts, ("",) * len(parts)))
     columns += [(f"contact_margin_{name}", values, (), ("",)) for name, values in solution.contact_margins.items()]
     return [Signal(key, x, tuple(n), tuple(u)) for key, x, n, u in columns if x is not None]
-
-
-def _row_names(scene: Scene) -> tuple[str, ...]:
-    return tuple(
-        f"{place.name}.{k - place.start + 1}" for place in layout(scene) for k in range(place.start, place.end)
-    )
 
 
 def times(solution: Solution) -> np.ndarray:

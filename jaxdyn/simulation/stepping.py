@@ -19,12 +19,11 @@ from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.contact_problem import contacts_of
 from jaxdyn.simulation.contact_steps import ContactStep, contact_step, mean_of_steps
 from jaxdyn.simulation.equations import DRIVES
-from jaxdyn.simulation.hybrid.motion import PiecewiseSystem, piecewise_motion
+from jaxdyn.simulation.hybrid import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import may_have_redundant_rows
 from jaxdyn.simulation.solvers import LibrarySteps
 from jaxdyn.simulation.solvers.diffrax_methods import RK4
-from jaxdyn.simulation.solvers.driver import step_control
-from jaxdyn.simulation.solvers.integrator import LibraryRun
+from jaxdyn.simulation.solvers.driver import LibraryRun, step_control
 from jaxdyn.simulation.solvers.steps import take_step
 from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike
@@ -85,10 +84,9 @@ def stepper(
     ```
     """
     scene = as_scene(scene)
-    seconds = _check_options(scene, dt, substeps, adjoint)
     system, dtype = scene.system, state_dtype(scene.system)
     by_contacts = limits is not None or has_modes(scene)
-    _check_smoothing(by_contacts, smoothing)
+    seconds = _check_options(dt, substeps, adjoint, smoothing, by_contacts)
     report = check_flag(report, "stepper: report")
     # In numpy a known length stays known inside a jit, where jax would trace it.
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
@@ -122,7 +120,7 @@ def stepper(
     return step
 
 
-def _check_options(scene: Scene, dt, substeps, adjoint):
+def _check_options(dt, substeps, adjoint, smoothing, by_contacts: bool):
     """Length of the step, s; ValueError for options that do not fit."""
     seconds = as_array(dt, "stepper: dt")
     if seconds.shape != () or (is_concrete(seconds) and not 0 < float(seconds) < np.inf):
@@ -131,6 +129,11 @@ def _check_options(scene: Scene, dt, substeps, adjoint):
         raise ValueError(f"stepper: substeps is {substeps!r}; give a positive integer")
     if adjoint not in ADJOINTS:
         raise ValueError(f"stepper: adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}")
+    energy = as_array(smoothing, "stepper: smoothing")
+    if energy.shape != () or (is_concrete(energy) and not 0 <= float(energy) < np.inf):
+        raise ValueError(f"stepper: smoothing is {smoothing!r}; give one energy (J), zero or more")
+    if not by_contacts and is_concrete(energy) and float(energy) > 0:
+        raise ValueError("stepper: smoothing is for scenes with contacts, and this one has none; leave it out")
     return seconds
 
 
@@ -187,7 +190,11 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
         selection = hide_unclear(select_rows(known(unknown), q, t, None)) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
-            _refuse_export(pieces)
+            if is_standalone():
+                raise ValueError(
+                    f"stepper: its steps end at the kinks of {', '.join(pieces.names)}, found by loops that exported code does "
+                    "not have; leave these forces out of the exported scene, and clip the torques before the step"
+                )
             system = PiecewiseSystem(plan, pieces, switching)
             rows, end = piecewise_motion(system, y, args, ts, 0.0, 0.0, size, substeps, substeps + 1, EVENTS, is_direct)
             result = end.result
@@ -202,17 +209,10 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
             run = LibraryRun(plan, step_control(solver, size), None, None, size, substeps, room=substeps)
             rows, (result, *_) = (run.direct if is_direct else run)(y, args, ts)
         state = state_of(jax.tree.map(lambda x: x[0], rows), t + length)
-        return (state, ContactStep({}, jnp.zeros_like(v), result, jnp.zeros((), v.dtype))) if report else state
+        none: Any = {"forces": {}, "limit_forces": jnp.zeros_like(v), "residual": jnp.zeros((), v.dtype)}
+        return (state, ContactStep(result=result, **none)) if report else state
 
     return start, advance
-
-
-def _check_smoothing(by_contacts: bool, smoothing) -> None:
-    energy = as_array(smoothing, "stepper: smoothing")
-    if energy.shape != () or (is_concrete(energy) and not 0 <= float(energy) < np.inf):
-        raise ValueError(f"stepper: smoothing is {smoothing!r}; give one energy (J), zero or more")
-    if not by_contacts and is_concrete(energy) and float(energy) > 0:
-        raise ValueError("stepper: smoothing is for scenes with contacts, and this one has none; leave it out")
 
 
 def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, report: bool) -> Callable:
@@ -243,11 +243,3 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
         return (state, of_step) if report else state
 
     return advance
-
-
-def _refuse_export(pieces) -> None:
-    if is_standalone():
-        raise ValueError(
-            f"stepper: its steps end at the kinks of {', '.join(pieces.names)}, found by loops that exported code does not "
-            "have; leave these forces out of the exported scene, and clip the torques before the step"
-        )

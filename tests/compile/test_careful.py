@@ -15,7 +15,7 @@ from jaxdyn import compile as backend
 from jaxdyn.compile import careful as pairs
 from jaxdyn.compile import kernel, mark_invalid, rolled, target
 from jaxdyn.compile.batch import any_sample
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.kernels import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.compile.operations import as_operations
 from jaxdyn.compile.primitive import kernel_p
 from jaxdyn.compile.trace import program_of

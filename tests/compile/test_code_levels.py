@@ -11,19 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdyn.compile import first_calls, kernel, objects, target
+from jaxdyn.compile import kernel, mode, stored, target
 
 pytestmark = pytest.mark.native
 
 
 @pytest.fixture
-def two_levels(monkeypatch, tmp_path):
+def two_levels(monkeypatch, folder):
     """All code is quick at first, and is not on disk."""
     monkeypatch.delenv("JAXDYN_COMPILATION_OPTIONS", raising=False)
-    monkeypatch.setattr(objects, "QUICK_LINES", 0)
-    objects.disk.set_cache_folder(tmp_path)
-    yield
-    objects.disk.set_cache_folder(None)
+    monkeypatch.setattr(stored, "QUICK_LINES", 0)
 
 
 def _solve(A, x):
@@ -49,12 +46,12 @@ def test_optimised_code_takes_the_place_of_quick_code(two_levels, batch):
     made, called = target._kernels[number], target._called[symbol]
     addresses = made.entry.kernel, called.address.value
     # The optimiser waits for a quiet second.
-    found = objects.find(made.row.identity)
+    found = stored.find_code(made.row.identity)
     assert found is not None and found.text
-    first_calls.wait_for_code()
+    mode.wait_for_code()
     assert made.entry.kernel != addresses[0] and called.address.value != addresses[1]
     for name in (made.row.identity, symbol):
-        better = objects.find(name)
+        better = stored.find_code(name)
         assert better is not None and not better.text
     np.testing.assert_array_equal(np.asarray(run(A, x)), quick)
 
@@ -64,10 +61,10 @@ def test_long_blocks_come_in_parts():
 
     def side(name: str, summand: str) -> list[str]:
         lines = [f"{name}:", f"  %{name}0 = fadd double %x, {summand}"]
-        lines += [f"  %{name}{i} = fadd double %{name}{i - 1}, {summand}" for i in range(1, 3 * objects.BLOCK_LINES)]
+        lines += [f"  %{name}{i} = fadd double %{name}{i - 1}, {summand}" for i in range(1, 3 * stored.BLOCK_LINES)]
         return [*lines, "  br label %joined"]
 
-    last = 3 * objects.BLOCK_LINES - 1
+    last = 3 * stored.BLOCK_LINES - 1
     text = "\n".join(
         [
             "define double @function(double %x) {",
@@ -82,8 +79,8 @@ def test_long_blocks_come_in_parts():
             "}",
         ]
     )
-    assert objects._in_short_blocks(text).count("br label") == 2 + 2 * 3
-    code = objects.Code(objects.compile_text(text, is_quick=True))
+    assert stored._in_short_blocks(text).count("br label") == 2 + 2 * 3
+    code = stored.Code(stored.compile_text(text, is_quick=True))
     function = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(code.address("function"))
     assert [function(2.0), function(0.5)] == [2.0 + last + 1, 0.5 + 2 * (last + 1)]
 
@@ -91,15 +88,13 @@ def test_long_blocks_come_in_parts():
 _SCRIPT = """
 import jax, jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
-from jaxdyn.compile import kernel, objects, target
-objects.QUICK_LINES = 0
+from jaxdyn.compile import kernel, stored, target
+stored.QUICK_LINES = 0
 x = jnp.linspace(0.1, 0.9, 5)
 print(repr(float(jax.jit(kernel(lambda x, y: jnp.sum(jnp.sin(x) / jnp.cos(y))))(x, x))))
 """
-_LOOK = "print([bool(objects.find(x.row.identity).text) for x in target._kernels.values()])\n"
-_LISTED = (
-    "from jaxdyn.compile import listing; listing.MIN_QUICK_OPERATIONS = 0\n"  # whose text is written after the call
-)
+_LOOK = "print([bool(stored.find_code(x.row.identity).text) for x in target._kernels.values()])\n"
+_LISTED = "from jaxdyn.compile import code; code.MIN_QUICK_OPERATIONS = 0\n"  # whose text is written after the call
 
 
 @pytest.mark.long
@@ -108,8 +103,8 @@ def test_quick_code_on_disk_is_optimised_by_another_process(monkeypatch, tmp_pat
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("JAXDYN_COMPILATION_OPTIONS", raising=False)
     # The first process ends before it optimises anything; the second one finds its code, and waits.
-    wait = "from jaxdyn.compile import first_calls; first_calls.wait_for_code()\n"
-    alone = "from jaxdyn.compile import first_calls; first_calls._SHORT_SECONDS = 1e6\nobjects.make = None\n"
+    wait = "from jaxdyn.compile import mode; mode.wait_for_code()\n"
+    alone = "from jaxdyn.compile import mode; mode._SHORT_SECONDS = 1e6\nstored.make_code = None\n"
     found = _SCRIPT.replace("x = jnp", alone + "x = jnp")
     lines = []
     for script in (tier + _SCRIPT, found + _LOOK + wait + _LOOK):
@@ -124,8 +119,8 @@ def test_quick_code_of_processes_that_end_soon_is_optimised_at_once(monkeypatch,
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("JAXDYN_COMPILATION_OPTIONS", raising=False)
     # No first call is ever over: what waits for that is not optimised.
-    busy = "from jaxdyn.compile import first_calls; first_calls._QUIET_SECONDS = 1e6\n"
-    look = "any(objects.find(x.row.identity).text for x in target._kernels.values())"
+    busy = "from jaxdyn.compile import mode; mode._QUIET_SECONDS = 1e6\n"
+    look = "any(stored.find_code(x.row.identity).text for x in target._kernels.values())"
     wait = f"import time; end = time.monotonic() + 60\nwhile {look} and time.monotonic() < end: time.sleep(0.01)\n"
     lines = []
     for script in (_SCRIPT + _LOOK, _SCRIPT + wait + _LOOK):
@@ -136,15 +131,15 @@ def test_quick_code_of_processes_that_end_soon_is_optimised_at_once(monkeypatch,
 
 
 def test_a_long_first_call_is_reported_once(monkeypatch, caplog, two_levels):
-    first_calls.wait_for_code()
-    monkeypatch.setattr(first_calls, "REPORTED_SECONDS", 0.0)
+    mode.wait_for_code()
+    monkeypatch.setattr(mode, "REPORTED_SECONDS", 0.0)
     scale = float(np.random.default_rng().normal())
     run = jax.jit(kernel(lambda x: jnp.sin(scale * x) + jnp.cos(x)))
     with caplog.at_level(logging.INFO, "jaxdyn"):
         for _ in range(2):
             run(jnp.arange(3.0)).block_until_ready()
-            first_calls.wait_for_code()
+            mode.wait_for_code()
     (message,) = [x.message for x in caplog.records if "first call" in x.message]
     shares = dict(re.findall(r"(\w+) (\d+) %", message))
-    assert list(shares) == [*first_calls.PHASES, "other"]
+    assert list(shares) == [*mode.PHASES, "other"]
     assert 97 <= sum(map(int, shares.values())) <= 103 and int(shares["XLA"]) > 0 and int(shares["LLVM"]) > 0

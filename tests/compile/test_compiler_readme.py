@@ -33,4 +33,4 @@ def test_table_lists_the_public_names():
     )
     public = {name for name in vars(jaxdyn.compile) if not name.startswith("_")}
     modules = {path.stem for path in Path(jaxdyn.compile.__file__).parent.iterdir()}
-    assert listed - {"batch", "known", "loops", "repair"} == public - modules
+    assert listed - {"batch", "known", "kernels", "repair"} == public - modules

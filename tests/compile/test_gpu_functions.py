@@ -9,7 +9,7 @@ import pytest
 from gpu_stand_in import run_threads
 from jax import lax
 
-from jaxdyn.compile import objects, target
+from jaxdyn.compile import stored, target
 from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.gpu import ptx
 from jaxdyn.compile.gpu.functions import FUNCTIONS, library_text
@@ -26,7 +26,7 @@ ATTRIBUTES = 'attributes #0 = { nounwind "no-builtins" }'
 def compiled(name):
     kind = ctypes.c_float if name not in FUNCTIONS and name != "fmod" else ctypes.c_double
     written = library_text(name).replace("define internal", "define")  # so that this test can call it
-    code = objects.Code(objects.compile_text(f"{written}\n{ATTRIBUTES}"))
+    code = stored.Code(stored.compile_text(f"{written}\n{ATTRIBUTES}"))
     arguments = 2 if name.removesuffix("f") in OF_TWO or name in OF_TWO else 1
     call = ctypes.CFUNCTYPE(kind, *[kind] * arguments)(code.address(name))
     call.code = code

@@ -24,30 +24,8 @@ def test_known_integers_wrap(dtype):
         # Known divisors that are zero end XLA's own compilation with a signal.
         n, by = jnp.asarray(known), jnp.asarray(np.array([3, -2, 2, 3, 5], dtype))
         mixed = jnp.stack([x, n[0], n[1]])  # one number that is not known, two that are
-        arithmetic = (
-            n + n,
-            n - n[::-1],
-            n * n,
-            -n,
-            jnp.abs(n),
-            n**3,
-            n << 3,
-            n >> 2,
-            lax.div(n, by),
-            lax.rem(n, by),
-        )
-        sums = (
-            n.sum(),
-            n.prod(),
-            jnp.cumsum(n),
-            n @ n,
-            mixed.sum(),
-            mixed.prod(),
-            jnp.cumsum(mixed),
-            mixed @ mixed,
-            mixed * 3,
-            mixed**3,
-        )
+        arithmetic = (n + n, n - n[::-1], n * n, -n, jnp.abs(n), n**3, n << 3, n >> 2, lax.div(n, by), lax.rem(n, by))
+        sums = [(x.sum(), x.prod(), jnp.cumsum(x), x @ x) for x in (n, mixed)], mixed * 3, mixed**3
         casts = n.astype(jnp.int32), n.astype(jnp.int64), n.astype(jnp.float64), n.astype(jnp.float64) > 2.0**31
         floats = jnp.asarray([1e30, -1e30, np.nan, np.inf, 2.9]).astype(dtype), -mixed, mixed - mixed[::-1]
         return jax.tree.leaves((arithmetic, sums, casts, floats))

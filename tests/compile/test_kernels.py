@@ -19,7 +19,7 @@ from jax import lax
 from kernel_helpers import native, quick, refuse
 
 from jaxdyn import compile as backend
-from jaxdyn.compile import derive, disk, evaluate, kernels, known, mode, objects, operations, target, trace
+from jaxdyn.compile import derive, disk, evaluate, kernels, known, mode, operations, stored, target, trace
 from jaxdyn.compile.code import kernel_ir
 from jaxdyn.compile.expansion import NotNumbers, expand
 from jaxdyn.compile.operations import as_operations
@@ -411,21 +411,8 @@ def test_derivatives_of_every_function():
 def test_derivatives_of_operations():
     """Reverse mode of what moves entries, and of loops."""
     x = 1.5 * normal(3, 4)
-    names = (
-        "reduce",
-        "nothing",
-        "cumsum",
-        "product",
-        "moves",
-        "joins",
-        "pad",
-        "gather",
-        "take",
-        "scatter",
-        "dynamic",
-        "scan",
-    )
-    names += ("dynamic update", "cond", "for", "solve", "barrier", "linear solve", "inner")
+    names = "reduce nothing cumsum product moves joins pad gather take scatter dynamic scan cond for solve barrier inner".split()
+    names += ["dynamic update", "linear solve"]
 
     def plain(x):
         computed = []
@@ -489,14 +476,8 @@ def _mixed(factors, x, n, flag):
     """Arrays of several dtypes and shapes, known numbers, reductions, and outputs that are arguments or constants."""
     rows = jnp.stack([x, factors * x[::-1], jnp.where(flag, x, -x)])
     total = jnp.sum(rows, axis=0) + jnp.min(rows) * n.astype(x.dtype)
-    return {
-        "total": total,
-        "corner": rows[1:, :2],
-        "larger": n + 1,
-        "same": x,
-        "known": jnp.asarray(factors),
-        "which": x > 0,
-    }
+    whole = {"larger": n + 1, "same": x, "known": jnp.asarray(factors), "which": x > 0}
+    return {"total": total, "corner": rows[1:, :2]} | whole
 
 
 FACTORS = np.array([1.0, 0.0, -2.0])
@@ -670,14 +651,13 @@ def test_results_do_not_depend_on_the_level_of_the_compiler(width, monkeypatch):
         return jnp.linalg.solve(A @ A.T + jnp.eye(4), z), jnp.where(z > y, z * y - x, x - z * y)
 
     A, x = rng.normal(size=(9, 4, 4)), rng.normal(size=(9, 4)) * 10
-    made = expand(jax.make_jaxpr(function)(A[0], x[0]), 10**5)[0]
-    text = kernel_ir(made, width, [False, False])
+    text = kernel_ir(numbers_of(function, A[0], x[0]), width, [False, False])
     assert "fmuladd" in text
     results = []
     for level in (0, 1):
-        monkeypatch.setattr(objects, "_level", lambda level=level: level)
-        monkeypatch.setattr(objects, "wanted_options", lambda level=level: "" if level else "least")
-        code, rows = objects.Code(objects.compile_text(text)), [np.empty((9, 4)), np.empty((9, 4))]
+        monkeypatch.setattr(stored, "_level", lambda level=level: level)
+        monkeypatch.setattr(stored, "wanted_options", lambda level=level: "" if level else "least")
+        code, rows = stored.Code(stored.compile_text(text)), [np.empty((9, 4)), np.empty((9, 4))]
         data = (ctypes.c_void_p * 4)(*(y.ctypes.data for y in (A, x, *rows)))
         ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * 3)(code.address("kernel"))(data, 9, 0, 9)
         results.append(rows)
@@ -929,36 +909,21 @@ def test_a_kernel_that_is_missing_is_said():
 # --- files of machine code ---
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """A folder of its own for object files."""
-    before = disk._folder, disk._is_off
-    backend_folder = tmp_path / "kernels"
-    disk.set_cache_folder(backend_folder)
-    yield backend_folder
-    disk._folder, disk._is_off = before
-
-
 IR = "define double @f(double %x) {\n  %y = fmul double %x, CONSTANT\n  ret double %y\n}"
 
 
 def code_of(number: float):
-    import ctypes
-
     text = IR.replace("CONSTANT", f"{number:.6e}")
-    made = objects.code_of(text)
-    return (
-        objects.name_of_file(hashlib.sha256(text.encode()).hexdigest()),
-        made,
-        ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f")),
-    )
+    made = stored.code_of(text)
+    function = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f"))
+    return stored.name_of_file(hashlib.sha256(text.encode()).hexdigest()), made, function
 
 
 def built(monkeypatch):
     """A list that grows when LLVM compiles."""
     seen = []
-    compiled = objects.compile_text
-    monkeypatch.setattr(objects, "compile_text", lambda *args: seen.append(args) or compiled(*args))
+    compiled = stored.compile_text
+    monkeypatch.setattr(stored, "compile_text", lambda *args: seen.append(args) or compiled(*args))
     return seen
 
 
@@ -981,11 +946,11 @@ def test_files_are_written_found_and_checked(folder, monkeypatch, caplog):
 
 
 def test_another_processor_or_version_has_other_files(monkeypatch):
-    before = objects.name_of_file("a program")
-    assert objects.name_of_file("another program") != before
-    monkeypatch.setattr(objects, "features", lambda: "+other")
-    monkeypatch.setattr(objects, "_environment", objects._environment.__wrapped__)
-    assert objects.name_of_file("a program") != before
+    before = stored.name_of_file("a program")
+    assert stored.name_of_file("another program") != before
+    monkeypatch.setattr(stored, "features", lambda: "+other")
+    monkeypatch.setattr(stored, "_environment_of_code", stored._environment_of_code.__wrapped__)
+    assert stored.name_of_file("a program") != before
 
 
 def test_old_files_are_removed(folder, monkeypatch):
@@ -1011,7 +976,7 @@ def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
     def function(x):
         return jnp.sin(x) * 7.654321
 
-    for place, name in ((objects, "compile_text"), (target, "kernel_ir"), (trace, "expand")):
+    for place, name in ((stored, "compile_text"), (target, "kernel_ir"), (trace, "expand")):
         with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt, jax.errors.JaxRuntimeError):
             patched.setattr(place, name, interrupted)
             jax.jit(native(lambda x: function(x)))(jnp.ones(3))
@@ -1089,11 +1054,7 @@ def test_cleared_caches_of_jax_change_nothing():
     np.testing.assert_array_equal(jax.jit(native(jnp.sin))(jnp.ones(3)), before)
 
 
-def test_the_folder_is_the_users_unless_set(monkeypatch, tmp_path):
-    before = disk._folder, disk._is_off
-    try:
-        disk.set_cache_folder(None)
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-        assert disk.cache_folder() == tmp_path / "jaxdyn" / "kernels"
-    finally:
-        disk._folder, disk._is_off = before
+def test_the_folder_is_the_users_unless_set(monkeypatch, folder, tmp_path):
+    disk.set_cache_folder(None)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert disk.cache_folder() == tmp_path / "jaxdyn" / "kernels"

@@ -9,8 +9,8 @@ import pytest
 from jax import lax
 
 import jaxdyn as jd
-from jaxdyn.compile import listing, objects, rolled, target
-from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, varying_first
+from jaxdyn.compile import rolled, stored, target
+from jaxdyn.compile.code import calls_itself, has_table, kernel_ir, subprogram_ir, varying_first
 from jaxdyn.compile.derive import tangent, transpose
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.trace import program_of
@@ -35,7 +35,7 @@ def compute(of: Program, width: int, uniform, arrays, is_listed: bool) -> list[n
     text = kernel_ir(of, width, uniform, is_listed)
     if calls_itself(of, width):
         text = None
-    code = objects.Code(objects.compile_text(text or subprogram_ir(of, width, is_listed)))
+    code = stored.Code(stored.compile_text(text or subprogram_ir(of, width, is_listed)))
     results = [np.zeros((SAMPLES, x.size), x.dtype) for x in of.outputs]
     order = varying_first(uniform)
     if text is None:
@@ -55,7 +55,7 @@ def compute(of: Program, width: int, uniform, arrays, is_listed: bool) -> list[n
 
 def assert_same(of: Program, monkeypatch, scale: float = 1.0):
     """The same results as code and as data, for one sample and for vectors."""
-    monkeypatch.setattr(listing, "MIN_QUICK_OPERATIONS", -1)
+    monkeypatch.setattr("jaxdyn.compile.code.MIN_QUICK_OPERATIONS", -1)
     rng = np.random.default_rng(0)
     for width in (1, target.width_of(of, None)):
         for one in (False, True):
@@ -133,7 +133,7 @@ def test_branches(monkeypatch):
 
 def test_large_programs_are_kernels(monkeypatch):
     """A program beyond the bound is a kernel, for one sample and in batches, and its gradient agrees with that of the code."""
-    monkeypatch.setattr(listing, "MIN_LISTED_OPERATIONS", 500)
+    monkeypatch.setattr("jaxdyn.compile.code.MIN_LISTED_OPERATIONS", 500)
     scene = jd.scenes.windows(count=3, length=1.1)  # numbers that no other test compiles
     q, v = jd.scenes.windows.start(count=3)
     tau = jnp.cos(jnp.arange(scene.nv))
@@ -141,7 +141,7 @@ def test_large_programs_are_kernels(monkeypatch):
     def acceleration(q, v):
         return jd.constrained_dynamics(scene, q, v, tau).acceleration
 
-    assert listing.has_table(program_of(_by_pivots.__wrapped__, (None,), scene, (q, v, tau, 0.0), flags="report")[1][0])
+    assert has_table(program_of(_by_pivots.__wrapped__, (None,), scene, (q, v, tau, 0.0), flags="report")[1][0])
     one = jax.jit(acceleration)(q, v)
     several = jax.jit(jax.vmap(acceleration))(jnp.stack([q] * 19), jnp.stack([v] * 19))
     gradient = jax.jit(jax.grad(lambda q, v: acceleration(q, v) @ tau, 1))(q, v)

@@ -67,8 +67,7 @@ needs_searches = pytest.mark.skipif(not HAS_SEARCHES, reason="jax 0.12 is the fi
 
 
 @pytest.mark.parametrize(
-    "case",
-    [pytest.param(x, marks=needs_searches) if x.startswith(("search", "interp")) else x for x in CASES],
+    "case", [pytest.param(x, marks=needs_searches) if x.startswith(("search", "interp")) else x for x in CASES]
 )
 def test_kernels_of_unknown_places(case):
     """Values in a batch, and first derivatives in both modes."""

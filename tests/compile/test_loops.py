@@ -9,7 +9,7 @@ from jaxdyn.compile import compilation, kernel, target
 from jaxdyn.compile.batch import repeat_while
 from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.expansion import expand
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.kernels import Carry, Given, Iteration, Task, run_loop
 
 
 def _turn(tree, constants, state, _):
@@ -161,7 +161,7 @@ def test_llvm_works_on_a_loop_while_xla_compiles(monkeypatch):
 def test_llvm_works_on_the_subprograms_of_a_batched_loop_while_it_is_traced(monkeypatch):
     """Once for each width of vectors, whatever is batched further; a loop of one sample may be batched later and waits."""
     tasks = []
-    monkeypatch.setattr(target.first_calls, "make_later", tasks.append)
+    monkeypatch.setattr(target.mode, "make_later", tasks.append)
     task = Task(lambda *args: _branching_turn(*args), ())
 
     def iterate(x):

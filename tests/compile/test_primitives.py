@@ -13,8 +13,8 @@ from jax import lax
 from jax.extend.core import Primitive, primitives
 
 from jaxdyn.compile import expansion, jax_adapter
+from jaxdyn.compile.derive import replay
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import replay
 
 X, Y = np.array([0.3, -0.7, 0.9]), np.array([1.2, 0.4, -0.6])
 POSITIVE, SQUARE = np.array([0.3, 1.7, 2.9]), np.array([[4.0, 1.0, 0.5], [1.0, 3.0, 0.2], [0.5, 0.2, 2.0]])

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
-from kernel_helpers import by_kernel
+from kernel_helpers import by_kernel, native
 
 from benchmarks.numpy_jaxprs import CONTRACTION, EQUAL_DIFFERENCE, ZERO_PRODUCT, ZERO_SIGN, trace_and_evaluate
 from benchmarks.random_functions import BINARY, NAMES, SPECIAL, UNARY, Function, differentiated, judge
-from jaxdyn.compile import kernel, target
+from jaxdyn.compile import target
 from jaxdyn.compile.expansion import expand
 
 pytestmark = pytest.mark.native
@@ -47,20 +47,12 @@ def test_values_and_derivatives_are_those_of_jax(function, points, dtype):
     step, cotangent = np.random.default_rng(0).normal(size=(2, *x.shape))
     args = x, jnp.asarray(step, dtype), jnp.asarray(cotangent, dtype)
     wanted = trace_and_evaluate(jax.vmap(differentiated(function)), *args)
-    program = expand(jax.make_jaxpr(differentiated(_native(function)))(*(y[0] for y in args)), 10**6)[0]
+    program = expand(jax.make_jaxpr(differentiated(native(function)))(*(y[0] for y in args)), 10**6)[0]
     samples = [target.call(program, [np.asarray(y[i]) for y in args]) for i in range(len(x))]
     verdicts = judge(function, args, [np.stack(column) for column in zip(*samples, strict=True)], wanted)
     different = [verdict for verdict in verdicts if isinstance(verdict, tuple)]
     assert not different, (function.steps, [(name, np.asarray(x[i])) for _, name, i in different])
     assert sum(verdicts.values()) == len(NAMES) * len(x)
-
-
-def _native(function):
-    return lambda x: kernel(lambda _, x: function(x), fallback=_refuse)((), x)
-
-
-def _refuse(*_):
-    raise AssertionError("there is no kernel")
 
 
 @pytest.mark.parametrize(

@@ -96,15 +96,6 @@ def test_keys_cover_the_package_the_versions_and_the_options(monkeypatch, tmp_pa
 # --- executables ---
 
 
-@pytest.fixture
-def folder(tmp_path):
-    """A folder of its own for what is kept."""
-    before = disk._folder, disk._is_off
-    disk.set_cache_folder(tmp_path / "kernels")
-    yield tmp_path / "kernels"
-    disk._folder, disk._is_off = before
-
-
 def forget():
     """Forget what this process has compiled, as a new one."""
     executables._find.cache_clear()
@@ -303,16 +294,12 @@ def test_callbacks_are_not_kept(folder, monkeypatch):
     assert not list(folder.glob("*.executable"))
 
 
-def test_a_folder_that_cannot_be_written(tmp_path, caplog):
-    before = disk._folder, disk._is_off
+def test_a_folder_that_cannot_be_written(folder, tmp_path, caplog):
     (tmp_path / "file").write_text("no folder")
-    try:
-        disk.set_cache_folder(tmp_path / "file" / "kernels")
-        forget()
-        assert entry_point(jd.so3.hat)(jnp.arange(3.0))[1, 0] == 2.0
-        assert entry_point(jd.so3.exp)(jnp.zeros(3))[0, 0] == 1.0
-    finally:
-        disk._folder, disk._is_off = before
+    disk.set_cache_folder(tmp_path / "file" / "kernels")
+    forget()
+    assert entry_point(jd.so3.hat)(jnp.arange(3.0))[1, 0] == 2.0
+    assert entry_point(jd.so3.exp)(jnp.zeros(3))[0, 0] == 1.0
     assert caplog.text.count("nothing is kept on disk") == 1
 
 

@@ -8,7 +8,7 @@ from jax import monitoring
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
-from jaxdyn.compile import executables, objects
+from jaxdyn.compile import executables, stored
 
 pytestmark = pytest.mark.native
 
@@ -38,15 +38,15 @@ def native(function):
 
 def test_an_error_of_llvm_is_told_to_who_calls(monkeypatch):
     """It is compiled again at the next call."""
-    fails, made = [True], objects.compile_text
+    fails, made = [True], stored.compile_text
 
     def failing(text, *options):
         if fails[0]:
             raise MemoryError("no room")
         return made(text, *options)
 
-    monkeypatch.setattr(objects, "compile_text", failing)
-    monkeypatch.setattr(objects, "find", lambda identity: None)
+    monkeypatch.setattr(stored, "compile_text", failing)
+    monkeypatch.setattr(stored, "find_code", lambda identity: None)
     function = backend.entry_point(native(lambda x: jnp.sin(x) * 1.47474))
     x = jnp.arange(3.0)
     with pytest.raises(jax.errors.JaxRuntimeError, match="could not be compiled"):
@@ -86,10 +86,10 @@ def test_the_least_optimisation_gives_other_code_and_the_same_numbers(request):
         scaled = model.replace(gravity=model.gravity * scale)
         return np.asarray(backend.entry_point(native(lambda q: jd.gravity_force(scaled, q)))(q))
 
-    one, key = torque(1.0), objects.name_of_file("a program")
+    one, key = torque(1.0), stored.name_of_file("a program")
     request.getfixturevalue("least")
     np.testing.assert_allclose(torque(2.0), 2 * one, rtol=1e-14)
-    assert objects.name_of_file("a program") != key
+    assert stored.name_of_file("a program") != key
     options = executables.quick_options()
     assert options is not None and options["xla_backend_optimization_level"] == 0
 
@@ -101,10 +101,10 @@ def test_long_texts_are_compiled_by_one_pass_to_the_same_numbers(monkeypatch, re
 
     def acceleration():
         function = native(lambda q: jd.forward_dynamics(model, q, 0.1 * q, 0 * q))
-        return np.asarray(backend.entry_point(function)(q)), objects.name_of_file("a program")
+        return np.asarray(backend.entry_point(function)(q)), stored.name_of_file("a program")
 
     usual, key = acceleration()
-    monkeypatch.setattr(objects, "LONG_LINES", 0)
+    monkeypatch.setattr(stored, "LONG_LINES", 0)
     model = model.replace(gravity=model.gravity * (1 + 1e-15))  # a program of its own
     long, other_key = acceleration()
     np.testing.assert_allclose(long, usual, rtol=1e-13)

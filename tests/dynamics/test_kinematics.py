@@ -176,7 +176,7 @@ def test_program_grows_with_the_logarithm_of_depth():
             jaxpr = jax.make_jaxpr(kinematics.forward_kinematics)(model, jnp.zeros(n))
         return str(jaxpr).count("dot_general")
 
-    assert operations(128) - operations(64) == operations(64) - operations(32) == 1
+    assert operations(256) - operations(128) == operations(128) - operations(64) == 1
 
 
 def test_neutral_is_home_and_derivatives_are_finite_there():

@@ -13,7 +13,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.compile import standalone
-from jaxdyn.compile.objects import code_of
+from jaxdyn.compile.stored import code_of
 
 X = np.linspace(0.1, 0.7, 7)
 V, TAU = 0.3 * np.cos(X), np.sin(3 * X)

@@ -16,8 +16,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import jaxdyn as jd
 from benchmarks import gpu as benchmark
 from jaxdyn import compile as backend
+from jaxdyn.compile import gpu as device
 from jaxdyn.compile import jax_adapter, mode, primitive
-from jaxdyn.compile.gpu import device, ptx
+from jaxdyn.compile.gpu import ptx
 
 pytestmark = pytest.mark.native
 

@@ -22,7 +22,7 @@ from jax.extend.core import Primitive
 import jaxdyn as jd
 from jaxdyn import compile as backend
 from jaxdyn.compile import expansion, jax_adapter, kernels, mode, target
-from jaxdyn.compile.kernels import run_trial
+from jaxdyn.compile.executables import run_trial
 
 ADAPTER = Path(jax_adapter.__file__)
 
@@ -383,7 +383,7 @@ def test_a_call_that_cannot_be_lowered_is_left_to_jax(future, monkeypatch):
 def test_wrong_numbers_leave_everything_to_jax(future, monkeypatch):
     """As those of jax 0.10.2 were."""
     rule = kernels.call_program
-    monkeypatch.setattr("jaxdyn.compile.kernels.call_program", lambda *args: [2 * x for x in rule(*args)])
+    monkeypatch.setattr("jaxdyn.compile.executables.call_program", lambda *args: [2 * x for x in rule(*args)])
     with one_warning("a kernel gives other numbers than JAX"):
         assert mode.current() == "plain"
 

@@ -10,7 +10,7 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 
 from jaxdyn import scenes
-from jaxdyn.compile import loops
+from jaxdyn.compile import kernels
 from jaxdyn.constraints import Pfaffian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
 from jaxdyn.dynamics.kinematics import forward_kinematics
@@ -357,7 +357,7 @@ def test_pendulum_in_one_velocity():
 @pytest.mark.parametrize("name", ["four_bar", "rolling_disk"])
 def test_motions_are_one_native_loop(name, monkeypatch):
     """With the default basis, whose rank is decided in every stage. By XLA a step costs ten times as much."""
-    monkeypatch.setattr(loops, "_run_by_jax", None)
+    monkeypatch.setattr(kernels, "_run_by_jax", None)
     scene, start = getattr(scenes, name)(), getattr(scenes, name).start()
     motions = [simulate(scene, *start, jnp.linspace(0.0, 0.2, 3), method=method) for method in ("reduced", "projected")]
     np.testing.assert_allclose(motions[0].q, motions[1].q, atol=1e-7)

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix
 import pytest
+from motion_helpers import within
 
 import jaxdyn as jd
-from jaxdyn.simulation.solvers import integrator
+from jaxdyn.simulation.solvers import diffrax_loop
 from jaxdyn.simulation.solvers.base import Adaptive
 
 TS = np.linspace(0.0, 6.0, 5)
@@ -36,7 +37,7 @@ def control(kind, ts, tolerance=1e-9):
 def options(kind, solver, ts, **changes):
     controller, adjoint = control(kind, jax.lax.stop_gradient(ts)), diffrax.RecursiveCheckpointAdjoint()
     term, meter = diffrax.ODETerm(lorenz), diffrax.NoProgressMeter()
-    return integrator.DiffraxRun(term, solver, controller, None, adjoint, 4096, meter, None)._replace(**changes)
+    return diffrax_loop.DiffraxRun(term, solver, controller, None, adjoint, 4096, meter, None)._replace(**changes)
 
 
 def moving(x, r, ts):
@@ -66,15 +67,15 @@ def test_reverse_mode_takes_the_steps_of_the_forward_run(kind, solver):
 
     def total(x, r, ts, adjoint):
         how = options(kind, solver, ts, adjoint=adjoint)
-        rows, facts = integrator.run_adaptively(moving(x, r, ts), how, True)
+        rows, facts = diffrax_loop.run_adaptively(moving(x, r, ts), how, True)
         return jnp.sum(WEIGHTS * rows["x"]), facts[:2]
 
     def repeated(x, r, ts):
         how = options(kind, solver, ts)
         fixed = jax.lax.stop_gradient((x, r, ts))
-        _, facts, taken = integrator._record(moving(*fixed), how, 4096)
-        again = integrator._repeat(how, taken, facts[2])._replace(adjoint=diffrax.ForwardMode())
-        return jnp.sum(WEIGHTS * integrator.run(moving(x, r, ts), again)[0]["x"])
+        _, facts, taken = diffrax_loop._record(moving(*fixed), how, 4096)
+        again = diffrax_loop._repeat(how, taken, facts[2])._replace(adjoint=diffrax.ForwardMode())
+        return jnp.sum(WEIGHTS * diffrax_loop.run(moving(x, r, ts), again)[0]["x"])
 
     @jax.jit
     def both(x, r, ts):
@@ -99,11 +100,11 @@ def test_reverse_mode_takes_the_steps_of_the_forward_run(kind, solver):
 @pytest.mark.slow
 def test_room_for_steps(monkeypatch):
     """Where no limit is given, reverse mode has one of its own, and beyond it the run says so."""
-    monkeypatch.setattr(integrator, "ROOM", 64)
+    monkeypatch.setattr(diffrax_loop, "ROOM", 64)
 
     def end(r, ts, given):
         how = options("own", diffrax.Tsit5(), ts)
-        rows, (result, stats, reached) = integrator.run_adaptively(moving(START[0], r, ts), how, given)
+        rows, (result, stats, reached) = diffrax_loop.run_adaptively(moving(START[0], r, ts), how, given)
         return rows["x"][-1, 0], (rows["x"], result, stats, reached)
 
     @jax.jit
@@ -139,7 +140,7 @@ def test_runs_that_end_early(case):
     def total(r):
         ts = jnp.asarray([0.0, 1e-6, 6.0])
         how = options("own", diffrax.Tsit5(), ts, max_steps=1 if case == "one step" else 8, term=diffrax.ODETerm(rates))
-        rows, (result, stats, _) = integrator.run_adaptively(moving(START[0], r, ts), how, True)
+        rows, (result, stats, _) = diffrax_loop.run_adaptively(moving(START[0], r, ts), how, True)
         return jnp.sum(jnp.where(jnp.isfinite(rows["x"]), rows["x"], 0.0)), (result, stats)
 
     slope, (result, stats) = jax.jit(jax.grad(total, has_aux=True))(START[1])
@@ -150,7 +151,7 @@ def test_runs_that_end_early(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"stepsize": jd.simulation.Steps(rtol=1e-10, atol=1e-10)}, {"stepsize": 5e-3}])
+@pytest.mark.parametrize("options", [{"stepsize": within(1e-10)}, {"stepsize": 5e-3}])
 def test_hessian_of_a_motion_over_the_default_adjoint(options):
     """Of q0 cos(w T) + v0 sin(w T)/w by q0, v0 and w, forward over reverse and reverse over reverse."""
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from motion_helpers import within
 from test_events import TIGHT, G, box
 from test_friction_scenes import bounce
 
@@ -193,7 +194,7 @@ def test_contacts_that_hold_do_not_slip_where_another_one_stops():
         v0,
         [0.0, 0.57],
         control=jax.tree_util.Partial(control),
-        stepsize=jd.simulation.Steps(rtol=drops.TOLERANCE, atol=drops.TOLERANCE),
+        stepsize=within(drops.TOLERANCE),
         events=[jd.events.ModeSwitches(1200)],
     )
     times, names = np.asarray(motion.events.time), motion.events.name

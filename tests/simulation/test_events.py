@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from scipy.optimize import brentq
 
 import jaxdyn as jd
@@ -38,7 +39,7 @@ def block_velocity(start, speed, sign):
 
 
 TS = jnp.linspace(0.0, 4.0, 41)
-TIGHT: Any = {"stepsize": jd.simulation.Steps(rtol=1e-11, atol=1e-11)}
+TIGHT: Any = {"stepsize": within(1e-11)}
 
 
 @pytest.fixture(scope="module")
@@ -132,12 +133,7 @@ def test_bowling_ball_rolls_when_the_closed_form_says():
     """Problem 5.4: the friction is that of the contact's own normal force."""
     r, m, inertia, g, mu = 0.10795, 6.35, 0.0296, 9.8, 0.12
     ts = jnp.linspace(0.0, 4.0, 5)
-    motion = jd.simulate(
-        jd.scenes.bowling_ball(),
-        *jd.scenes.bowling_ball.start(),
-        ts,
-        stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10),
-    )
+    motion = jd.simulate(jd.scenes.bowling_ball(), *jd.scenes.bowling_ball.start(), ts, stepsize=within(1e-10))
     up, v, w = np.array([0, 0, 1.0]), np.array([8.0, 0, 0]), np.array([-8 * np.pi, 0, 0])
     slip = v + np.cross(w, -r * up)
     rolling = r / (inertia + m * r * r) * np.cross(inertia * w + m * r * np.cross(up, v), up)
@@ -231,9 +227,7 @@ def test_contact_lets_go_where_it_would_pull():
     scene = jd.Scene(builder.build(), forces=(jd.contact.UnilateralContact(touching),))
     start = 0.1
     q0 = [np.sin(start), 0.0, np.cos(start), 1.0, 0.0, 0.0, 0.0]
-    motion = jd.simulate(
-        scene, q0, jnp.zeros(6), jnp.linspace(0.0, 1.5, 151), stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10)
-    )
+    motion = jd.simulate(scene, q0, jnp.zeros(6), jnp.linspace(0.0, 1.5, 151), stepsize=within(1e-10))
     assert list(motion.events.name[:2]) == ["bead: release", ""]
     leaves = float(motion.events.time[0])
     i = int(np.argmax(motion.ts > leaves))
@@ -299,13 +293,7 @@ def test_gradients_go_through_events():
     def computed(p):
         scene = block(p[0], p[1], p[2])
         motion = jd.simulate(
-            scene,
-            jnp.zeros(1),
-            p[3:],
-            ts,
-            control=load,
-            stepsize=jd.simulation.Steps(rtol=1e-13, atol=1e-13),
-            events=[jd.events.ModeSwitches(4)],
+            scene, jnp.zeros(1), p[3:], ts, control=load, stepsize=within(1e-13), events=[jd.events.ModeSwitches(4)]
         )
         return jnp.concatenate([motion.q[:, 0], motion.v[:, 0], motion.events.time[:3]])
 
@@ -335,7 +323,7 @@ def test_second_derivatives_go_through_events():
             p[2:],
             ts,
             control=load,
-            stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12),
+            stepsize=within(1e-12),
             events=[jd.events.ModeSwitches(3)],
         )
         return (
@@ -358,14 +346,7 @@ def test_gradients_go_through_an_impact():
 
     def computed(p):
         q0, v0 = jnp.stack([0 * p[1], p[1], p[2]]), jnp.stack([p[3], 0 * p[3], 0 * p[3]])
-        motion = jd.simulate(
-            box(p[0]),
-            q0,
-            v0,
-            ts,
-            stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12),
-            events=[jd.events.ModeSwitches(6)],
-        )
+        motion = jd.simulate(box(p[0]), q0, v0, ts, stepsize=within(1e-12), events=[jd.events.ModeSwitches(6)])
         return jnp.concatenate([motion.q.ravel(), motion.v.ravel(), motion.events.time[:2]])
 
     at = jnp.asarray([0.4, 0.5, 0.3, 0.7])
@@ -386,7 +367,7 @@ def test_friction_in_proportion_to_a_multiplier_of_both_sides():
     def motion(sign):
         hoop = jd.Holonomic(lambda q, t: sign * (jnp.sqrt(q @ q) - 1.0), name="hoop")
         scene = jd.Scene(system, (hoop,), (jd.contact.DryFriction(0.3, "hoop", along),))
-        options = {"stepsize": jd.simulation.Steps(rtol=1e-11, atol=1e-11), "outputs": ("multipliers",), "throw": False}
+        options = {"stepsize": within(1e-11), "outputs": ("multipliers",), "throw": False}
         return jd.simulate(scene, jnp.asarray([1.0, 0.0]), jnp.asarray([0.0, 2.0]), ts, **options)
 
     run = jax.jit(motion)
@@ -436,14 +417,7 @@ def test_belt_drags_a_block_along_until_the_spring_is_stronger():
 def test_float32_finds_the_same_events():
     with jax.enable_x64(False):
         scene = jd.Scene(jd.scenes.sliding_block().system, forces=(jd.contact.DryFriction(MU, G, 0, static=MU_S),))
-        motion = jd.simulate(
-            scene,
-            [0.0],
-            [2.0],
-            jnp.linspace(0.0, 4.0, 5),
-            control=load,
-            stepsize=jd.simulation.Steps(rtol=1e-5, atol=1e-5),
-        )
+        motion = jd.simulate(scene, [0.0], [2.0], jnp.linspace(0.0, 4.0, 5), control=load, stepsize=within(1e-5))
         assert motion.q.dtype == jnp.float32 and motion.success
         assert list(motion.events.name[:4]) == ["friction: turn", "friction: stick", "friction: slip", ""]
         np.testing.assert_allclose(motion.events.time[:3], [2.135119, 3.427974, 3.620121], atol=1e-3)
@@ -538,7 +512,7 @@ def test_constraints_are_closed_at_coarse_tolerances_too():
     def run(**options):
         return jd.simulate(scene, [0.0, -1.0], [30.0, 0.0], jnp.linspace(0, 1.0, 3), throw=False, **options)
 
-    coarse = run(stepsize=jd.simulation.Steps(rtol=0.1, atol=0.1))
+    coarse = run(stepsize=within(0.1))
     assert bool(coarse.success)
     np.testing.assert_allclose(np.linalg.norm(coarse.q, axis=1), 1.0, atol=1e-10)
     # No circle is within reach of steps of three turns.

@@ -5,18 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import slider
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from jaxdyn.simulation.solution import RESULTS
 
 SOLVERS = {"RK4": None, "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8(), "Rodas5P": jd.solvers.Rodas5P()}
-
-
-def slider():
-    builder = jd.ModelBuilder("slider", gravity=None)
-    builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(1.0, (0, 0, 0), (0, 0, 0)))
-    return builder.build()
 
 
 def codes(result):

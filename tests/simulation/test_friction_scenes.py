@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from motion_helpers import within
 from test_events import box
 
 import jaxdyn as jd
 from jaxdyn import scenes
 
 G, MASSES, MOMENTS = 9.81, (1.0, 0.6), (0.5, 0.2)
-TIGHT = {"stepsize": jd.simulation.Steps(rtol=1e-11, atol=1e-11)}
+TIGHT = {"stepsize": within(1e-11)}
 TS = jnp.linspace(0.0, 2.0, 21)
 
 
@@ -244,12 +245,10 @@ def test_cotangents_of_a_run_with_too_many_events_are_nan():
     def heights(e, h, row):
         return bounce(e, h, most=1, end=1.0).q[row, 0]
 
-    slopes = jax.jit(jax.vmap(jax.grad(heights, (0, 1)), (0, 0, None)))(
-        jnp.array([0.8, 0.8]), jnp.array([1.0, 0.05]), 8
-    )
-    late = jax.jit(jax.vmap(jax.grad(heights, (0, 1)), (0, 0, None)))(jnp.array([0.8, 0.8]), jnp.array([1.0, 0.05]), 1)
-    for slope in (*slopes, *late):
-        assert np.isfinite(slope[0]) and np.isnan(slope[1])
+    slopes = jax.jit(jax.vmap(jax.grad(heights, (0, 1)), (0, 0, None)))
+    for row in (8, 1):
+        for slope in slopes(jnp.array([0.8, 0.8]), jnp.array([1.0, 0.05]), row):
+            assert np.isfinite(slope[0]) and np.isnan(slope[1])
 
 
 @pytest.mark.slow

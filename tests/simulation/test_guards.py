@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
@@ -16,8 +17,9 @@ from jaxdyn.grasp import contact
 from jaxdyn.simulation.solvers.guards import Point, Search, search_root
 
 TS = np.linspace(0.0, 3.0, 7)
+STOPS = [jd.events.JointLimit()]
 ROUNDING = np.finfo(float).eps ** 0.5  # that conditions let pass, of the size of a limit or a force
-TIGHT: dict[str, Any] = {"stepsize": jd.simulation.Steps(rtol=1e-12, atol=1e-12)}
+TIGHT: dict[str, Any] = {"stepsize": within(1e-12)}
 WEIGHT = 2.0 * 9.81
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z of the contact along y of the plane
 
@@ -61,9 +63,7 @@ RAIL, FREE, BLOCK = cart(lower=-1.0, upper=1.0), cart(), block()
 
 def limit(v, **options):
     """q(t) = v t + t^2/4 from the middle of the rail to its end."""
-    return jd.simulate(
-        RAIL, jnp.zeros(1), v[None], TS, control=push_cart, events=[jd.events.JointLimit()], throw=False, **options
-    )
+    return jd.simulate(RAIL, jnp.zeros(1), v[None], TS, control=push_cart, events=STOPS, throw=False, **options)
 
 
 def cone(rate, **options):
@@ -111,11 +111,7 @@ CASES = {
         "contact_lost",
     ),
     "controller": Case(
-        spring,
-        np.array([3.0, 2.0, 7.0]),
-        spring_time,
-        lambda k: -spring_time(k) / (2 * k),
-        "control_singular",
+        spring, np.array([3.0, 2.0, 7.0]), spring_time, lambda k: -spring_time(k) / (2 * k), "control_singular"
     ),
 }
 EXPLICIT = {
@@ -166,7 +162,7 @@ def test_a_single_motion_has_both_modes(name):
 def test_implicit_steps_find_the_same_time(name):
     """In the loop of diffrax, by its dense output of third order."""
     case = CASES[name]
-    options: dict[str, Any] = {"solver": diffrax.Kvaerno5(), "stepsize": jd.simulation.Steps(rtol=1e-9, atol=1e-9)}
+    options: dict[str, Any] = {"solver": diffrax.Kvaerno5(), "stepsize": within(1e-9)}
     gradient = jax.value_and_grad(end_of(case.move, **options), has_aux=True)
     (times, solution), derivatives = jax.jit(jax.vmap(gradient))(jnp.asarray(case.numbers))
     assert np.asarray(solution.result == getattr(jd.RESULTS, case.code)).all()
@@ -186,16 +182,10 @@ def test_a_basis_and_limits_in_one_run_have_derivatives():
     )
 
     def time(rate, **options):
-        run = jd.simulate(
-            limits, q, rate * v, jnp.linspace(0.0, 1.0, 5), events=[jd.events.JointLimit()], throw=False, **options
-        )
+        run = jd.simulate(limits, q, rate * v, jnp.linspace(0.0, 1.0, 5), events=STOPS, throw=False, **options)
         return run.stats["time_reached"]
 
-    implicit: dict[str, Any] = {
-        "method": "reduced",
-        "solver": diffrax.Kvaerno5(),
-        "stepsize": jd.simulation.Steps(rtol=1e-9, atol=1e-9),
-    }
+    implicit: dict[str, Any] = {"method": "reduced", "solver": diffrax.Kvaerno5(), "stepsize": within(1e-9)}
     computed, expected = (jax.value_and_grad(time)(1.0, **options) for options in (implicit, TIGHT))
     np.testing.assert_allclose(computed, expected, rtol=1e-5)
 
@@ -219,7 +209,7 @@ def test_the_continuous_adjoint_is_refused(name):
 
 
 def test_a_start_behind_the_guard_is_the_end():
-    beyond = jd.simulate(RAIL, [1.5], [0.0], TS, control=push_cart, events=[jd.events.JointLimit()], throw=False)
+    beyond = jd.simulate(RAIL, [1.5], [0.0], TS, control=push_cart, events=STOPS, throw=False)
     assert beyond.result == jd.RESULTS.joint_limit_passed and float(beyond.stats["time_reached"]) == 0.0
     assert np.isfinite(beyond.q[0]).all() and np.isnan(beyond.q[1:]).all()
 
@@ -231,35 +221,21 @@ def test_the_same_without_kernels():
     np.testing.assert_allclose(solution.stats["time_reached"], limit_time(0.5), rtol=1e-10)
 
 
-def test_a_guard_that_is_violated_within_a_step_ends_the_motion():
-    """The middle of a step shows a limit that is passed on the way there and back."""
-    top = 1.0 + 1e-3
-
-    def back(q, v, t):
-        return -jnp.ones_like(v)
-
-    # q = v t - t^2/4 has its top v^2 at 2 v, and is above one for 0.13 s; the second step has its middle there.
-    v = np.sqrt(top)
-    ts, options = (
-        np.linspace(0.0, 4 * v, 3),
-        {"events": [jd.events.JointLimit()], "stepsize": 4 * v / 3, "throw": False},
-    )
-    solution = jd.simulate(RAIL, [0.0], [v], ts, control=back, **options)
-    assert solution.result == jd.RESULTS.joint_limit_passed
-    time = 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
-    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)
-
-
 def there_and_back(depth, **options):
     """q = v t - t^2/4, whose top is above the end of the rail by `depth`, in steps that are not told of it."""
     top = 1.0 + depth
     v = np.sqrt(top)
     ts = np.linspace(0.0, 4 * v, options.pop("saves", 2))
     back = lambda q, v, t: -jnp.ones_like(v)  # noqa: E731
-    run = jd.simulate(
-        RAIL, jnp.zeros(1), jnp.asarray([v]), ts, control=back, events=[jd.events.JointLimit()], throw=False, **options
-    )
+    run = jd.simulate(RAIL, jnp.zeros(1), jnp.asarray([v]), ts, control=back, events=STOPS, throw=False, **options)
     return run, 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
+
+
+def test_a_guard_that_is_violated_within_a_step_ends_the_motion():
+    """The top is at 2 v, and above one for 0.13 s; the second step has its middle there."""
+    solution, time = there_and_back(1e-3, saves=3, stepsize=4 * np.sqrt(1.001) / 3)
+    assert solution.result == jd.RESULTS.joint_limit_passed
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)
 
 
 LONG = {
@@ -297,9 +273,7 @@ def test_short_passages_of_an_oscillation_are_found():
 
     def time(w):
         law = jax.tree_util.Partial(lambda w, q, v, t: -2.0 * w * w * q, w)
-        run = jd.simulate(
-            RAIL, jnp.zeros(1), 1.001 * w[None], TS, control=law, events=[jd.events.JointLimit()], throw=False
-        )
+        run = jd.simulate(RAIL, jnp.zeros(1), 1.001 * w[None], TS, control=law, events=STOPS, throw=False)
         return run.stats["time_reached"], run.result == jd.RESULTS.joint_limit_passed
 
     wanted = np.arcsin((1 + ROUNDING) / 1.001) / np.asarray(frequencies)
@@ -336,9 +310,7 @@ def limit_of(p, **options):
     """q(t) = v t + F t^2/4 of both numbers, and the end of the save points."""
     law = jax.tree_util.Partial(lambda force, q, v, t: force[None], p[1])
     ts = jnp.linspace(0.0, p[2], 4)
-    run = jd.simulate(
-        RAIL, jnp.zeros(1), p[:1], ts, control=law, events=[jd.events.JointLimit()], throw=False, **options
-    )
+    run = jd.simulate(RAIL, jnp.zeros(1), p[:1], ts, control=law, events=STOPS, throw=False, **options)
     return run.stats["time_reached"]
 
 

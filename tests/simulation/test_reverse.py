@@ -8,7 +8,7 @@ import pytest
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from jaxdyn.simulation import integration
+from jaxdyn.simulation import motion
 from jaxdyn.simulation.solvers import reverse
 
 pytestmark = pytest.mark.native
@@ -56,7 +56,7 @@ def gradients(adjoint, jit=jax.jit, **options):
 def test_derivatives_are_those_of_diffrax(options, monkeypatch):
     own, replay = gradients("reverse", **options), gradients("direct", quick, **options)
     with monkeypatch.context() as patch:
-        patch.setattr(integration, "choose_loop", lambda *_: ("diffrax", "for comparison"))
+        patch.setattr(motion, "choose_loop", lambda *_: ("diffrax", "for comparison"))
         peer = gradients("direct", quick, **options)
     for x, y, z in zip(own, replay, peer, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-11)

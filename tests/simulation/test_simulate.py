@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
+from mechanisms import slider
+from motion_helpers import central_difference, within
 from pinocchio_bridge import ROBOTS, assert_close, quick, to_jaxdyn
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -19,7 +21,7 @@ from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import integrate, neutral
-from jaxdyn.simulation import Pose, integration
+from jaxdyn.simulation import Pose, motion
 from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS
@@ -89,15 +91,8 @@ def test_projected_solver_steps_on_the_manifold_and_evaluates_the_first_stage_an
             y1, error, dense, state, _ = solver.step(term, k * h, (k + 1) * h, y0, None, state, False)
             interpolation = solver.interpolation_cls(t0=jnp.asarray(k * h), t1=jnp.asarray((k + 1) * h), **dense)
             ends = [interpolation.evaluate(jnp.asarray(x)) for x in (k * h, (k + 1) * h)]
-            computed = (
-                y0,
-                y1,
-                error,
-                jax.tree.map(lambda k: k[0] / h, dense["dense_info"]["k"]),
-                dense["shift"],
-                *ends,
-            )
-            out.append([y["x"] for y in computed])
+            first_stage = jax.tree.map(lambda k: k[0] / h, dense["dense_info"]["k"])
+            out.append([y["x"] for y in (y0, y1, error, first_stage, dense["shift"], *ends)])
             y0 = y1
         return out
 
@@ -119,7 +114,7 @@ def test_only_models_with_quaternions_are_retracted(pendulum, leg, monkeypatch):
         wrapped.extend([] if project is None else [project])
         return LibrarySteps(solver, project, *more, **fields)
 
-    monkeypatch.setattr(integration, "LibrarySteps", made)
+    monkeypatch.setattr(motion, "LibrarySteps", made)
     for model, size in ((pendulum, 0), (leg, 1)):
         q0, v0 = neutral(model), jnp.zeros(model.nv)
         jax.make_jaxpr(lambda q, v, model=model: simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)
@@ -198,7 +193,7 @@ def test_panda_against_pinocchio_and_scipy():
     reference = solve_ivp(rate, (0, 1), x0, "DOP853", ts, rtol=1e-12, atol=1e-12).y.T
     scene = Scene(model, forces=(JointDamping(2.0),))
     control = Feedback(jnp.asarray(0.4), jnp.asarray(push))
-    solution = simulate(scene, q0, v0, ts, control=control, stepsize=Steps(rtol=1e-12, atol=1e-12))
+    solution = simulate(scene, q0, v0, ts, control=control, stepsize=within(1e-12))
     scale = np.abs(reference[:, robot.nq :]).max()
     np.testing.assert_allclose(solution.q, reference[:, : robot.nq], rtol=0, atol=1e-9)
     np.testing.assert_allclose(solution.v, reference[:, robot.nq :], rtol=0, atol=1e-9 * scale)
@@ -209,21 +204,9 @@ def driven(leg):
     """The leg with damping, friction, a spring and a control, with every output."""
     forces = (JointDamping(0.1), CoulombFriction(0.05, v_s=0.5), JointSpring(1.5))
     control = Feedback(jnp.asarray(0.05), jnp.asarray([0.3, -0.2, 0.1, 0.4]))
-    outputs = ("energy", "work", "power", "acceleration", Pose("foot"))
+    options = {"stepsize": within(1e-12), "outputs": ("energy", "work", "power", "acceleration", Pose("foot"))}
     scene = Scene(leg, forces=forces)
-    return (
-        scene,
-        control,
-        simulate(
-            scene,
-            Q0,
-            V0,
-            np.linspace(0, 2, 401),
-            control=control,
-            stepsize=Steps(rtol=1e-12, atol=1e-12),
-            outputs=outputs,
-        ),
-    )
+    return scene, control, simulate(scene, Q0, V0, np.linspace(0, 2, 401), control=control, **options)
 
 
 @pytest.mark.long
@@ -263,9 +246,7 @@ def test_outputs_are_those_of_the_saved_states(driven, leg):
 @pytest.mark.slow
 def test_stiff_friction_with_an_implicit_method():
     """Dry friction smoothed over 1e-5 m/s: sinh(v / v_s) decays at level / (m v_s) = 5e4 1/s."""
-    builder = ModelBuilder("slider", gravity=None)
-    builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(2.0, (0, 0, 0), (0, 0, 0)))
-    scene = Scene(builder.build(), forces=(CoulombFriction(1.0, v_s=1e-5),))
+    scene = Scene(slider(2.0), forces=(CoulombFriction(1.0, v_s=1e-5),))
     # It slides from 1 m/s at -0.5 m/s^2 and is at rest, all but v_s, at 2 s.
     ts = np.array([0.0, 0.5, 1.0, 1.9, 2.5, 4.0])
     solution = simulate(scene, [0.0], [1.0], ts, solver=diffrax.Kvaerno5(), stepsize=Steps(rtol=1e-8, atol=1e-10))
@@ -296,20 +277,12 @@ def leg_end(leg, z, q0, **options):
     return jnp.sum(out.q[-1] * jnp.arange(1.0, 6.0)) + jnp.sum(out.v[1:] * jnp.arange(1.0, 5.0)[None])
 
 
-def central_difference(function, point, step=1e-4):
-    """Fourth-order differences of a batched function, every coordinate in one call."""
-    offsets = step * np.array([1, -1, 2, -2])[:, None, None] * np.eye(point.size)
-    values = np.asarray(function(jnp.asarray((point + offsets).reshape(-1, point.size))))
-    one, minus, two, minus_two = values.reshape(4, point.size, *values.shape[1:])
-    return (8 * (one - minus) - (two - minus_two)) / (12 * step)
-
-
 @pytest.mark.long
 def test_reverse_mode_against_finite_differences(leg):
     """Masses, start, coefficients and control, with adaptive steps; and finite at rest, where error estimates vanish."""
 
     def function(z, q0):
-        return leg_end(leg, z, q0, stepsize=Steps(rtol=1e-13, atol=1e-13))
+        return leg_end(leg, z, q0, stepsize=within(1e-13))
 
     q0 = jnp.asarray(Q0)
     slope = central_difference(quick(jax.vmap(lambda z: function(z, q0))), POINT)
@@ -364,7 +337,7 @@ def test_modes_and_second_order(pendulum):
 def test_continuous_adjoint(pendulum):
     """Its gradients are those of the exact motion, to the tolerance of the solution."""
     z = jnp.asarray([1.2, 0.7, -0.5, 0.1, 0.05, 0.3])
-    tight = {"stepsize": Steps(rtol=1e-10, atol=1e-10)}
+    tight = {"stepsize": within(1e-10)}
     gradient = quick(jax.grad(lambda z: swing(pendulum, z, adjoint="backsolve", **tight)))(z)
     expected = quick(jax.grad(lambda z: swing(pendulum, z, **tight)))(z)
     np.testing.assert_allclose(gradient, expected, rtol=1e-7)

@@ -25,16 +25,15 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import cond, while_loop
-from jaxdyn.compile.loops import Carry, Given
+from jaxdyn.compile.kernels import Carry, Given
 from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
 from jaxdyn.simulation.hybrid.reactions import Collision
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
 from jaxdyn.simulation.solvers import driver
-from jaxdyn.simulation.solvers.driver import step_control
+from jaxdyn.simulation.solvers.driver import Integrator, LibraryRun, step_control, zeros_or
 from jaxdyn.simulation.solvers.guards import delay
-from jaxdyn.simulation.solvers.integrator import Integrator, LibraryRun, zeros_or
 from jaxdyn.simulation.solvers.steps import Plan
 
 

@@ -129,13 +129,10 @@ def normal_load(scene: Scene, element: Element, q, v, t) -> Array:
 
 def extend(scene: Scene) -> Scene:
     """Scene with the rows of its elements behind its own, and without these forces."""
+    elements: list[Any] = [x for x in scene.forces if isinstance(x, WithModes)]
     # Behind the scene's own rows, whose indices stay as they are: outputs take the first `own` multipliers.
-    more = [_constraint(force) for force in scene.forces if isinstance(force, WithModes)]
+    more = [x.contact if isinstance(x, UnilateralContact) else x.along for x in elements]
     return add_constraints(scene, more, [force for force in scene.forces if not isinstance(force, WithModes)])
-
-
-def _constraint(force: Any):
-    return force.contact if isinstance(force, UnilateralContact) else force.along
 
 
 def elements_of(scene: Scene, pieces: Pieces) -> Elements:

@@ -32,7 +32,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import while_loop
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.kernels import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.contact import coulomb
 from jaxdyn.lie.so3 import matmul

@@ -7,14 +7,7 @@ from jaxdyn.simulation.solvers.diffrax_methods import Rodas5P as Rodas5P
 from jaxdyn.simulation.solvers.diffrax_methods import Stepper as Stepper
 from jaxdyn.simulation.solvers.steps import LibrarySteps as LibrarySteps
 
-__all__ = [
-    "RK4",
-    "LibrarySteps",
-    "LieGroup",
-    "ProjectedSolver",
-    "Rodas5P",
-    "Stepper",
-]
+__all__ = ["RK4", "LibrarySteps", "LieGroup", "ProjectedSolver", "Rodas5P", "Stepper"]
 
 
 def __dir__() -> list[str]:

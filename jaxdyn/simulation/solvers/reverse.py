@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel, values_of_rules
 from jaxdyn.compile.batch import cond
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.kernels import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.simulation.solvers.steps import Plan, dense_output, differentiable_step, take_step
 
 # States that are kept of a run: 4 kB a number of the state in float64, which a cache holds for small mechanisms.

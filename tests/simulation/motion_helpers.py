@@ -1,0 +1,19 @@
+"""What the tests of motions share."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.simulation.options import Steps
+
+
+def within(tolerance) -> Steps:
+    """Adaptive steps that keep a tolerance."""
+    return Steps(rtol=tolerance, atol=tolerance)
+
+
+def central_difference(function, point, step=1e-4):
+    """Fourth-order differences of a batched function, every coordinate in one call."""
+    offsets = step * np.array([1, -1, 2, -2])[:, None, None] * np.eye(point.size)
+    values = np.asarray(function(jnp.asarray((point + offsets).reshape(-1, point.size))))
+    one, minus, two, minus_two = values.reshape(4, point.size, *values.shape[1:])
+    return (8 * (one - minus) - (two - minus_two)) / (12 * step)
