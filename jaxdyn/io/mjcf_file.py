@@ -50,6 +50,7 @@ class CompiledFile(NamedTuple):
 
 
 def import_mujoco():
+    """MuJoCo, or an error that names its extra."""
     try:
         import mujoco
     except ImportError as error:
@@ -139,6 +140,8 @@ def _without_file(mujoco, spec, name: str) -> str:
 
 
 def assign_names(mujoco, m, path: str) -> CompiledFile:
+    """Give each body and joint of a compiled file a name: its own, or one made of its kind and number."""
+
     def all_of(kind: str, count: int) -> list[str]:
         code = getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
         return [mujoco.mj_id2name(m, code, i) or "" for i in range(count)]
