@@ -236,6 +236,31 @@ def test_mjcf_geoms_touch_a_plane(tmp_path):
     assert set(touching) == {"c"} and float(touching["c"].coefficient) == 0.3
 
 
+@pytest.mark.parametrize("second", [0.2, 0.3])
+def test_mjcf_override_of_friction_is_mujocos(second, tmp_path):
+    """Of all geoms and pairs, by priority or not; another coefficient in the second direction is named."""
+    path = tmp_path / "scene.xml"
+    pairs = '<contact><pair geom1="floor" geom2="ball" friction="0.6 0.5 0 0 0"/></contact>'
+    override = f'<option o_friction="0.2 {second}" o_margin="10"><flag override="{{}}able"/></option>'
+    for flag, ball in (("dis", 0.6), ("en", 0.2)):
+        path.write_text(MJCF.format(ground=FLOOR, more=pairs + override.format(flag)))
+        scene = load(path, contacts="ground")
+        touching = touching_of(scene)
+        m = mujoco.MjModel.from_xml_path(str(path))
+        m.geom_margin[:] = m.pair_margin[:] = 10.0
+        mujoco.mj_forward(m, d := mujoco.MjData(m))
+        theirs = {m.body(m.geom_bodyid[contact.geom].max()).name: set() for contact in d.contact}
+        for contact in d.contact:
+            if m.geom("floor").id in contact.geom:
+                theirs[m.body(m.geom_bodyid[contact.geom].max()).name].add(contact.friction[0])
+        for name in "bcd":
+            assert {float(one.coefficient) for key, one in touching.items() if key[0] == name} == theirs[name]
+        assert theirs["c"] == {ball}
+        named = [line for line in scene.not_taken if line.startswith("friction of bodies in a second direction: ")]
+        expected = ["b, c, d"] if flag == "en" and second == 0.3 else [] if flag == "en" else ["c"]
+        assert [line.partition(": ")[2] for line in named] == expected
+
+
 def test_mjcf_height_fields_and_no_ground(tmp_path):
     """Heights at the nodes and a plane z = 0 where the file has none; a file that disables contacts."""
     path = tmp_path / "scene.xml"

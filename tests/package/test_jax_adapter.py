@@ -29,18 +29,14 @@ ADAPTER = Path(jax_adapter.__file__)
 
 def names_of_jax(tree: ast.Module) -> set[str]:
     """Dotted names of JAX in a module: what it imports and the attributes of that."""
-    local, inner = {}, {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    local, names = {}, set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            tops = {
-                alias.name.partition(".")[0]: alias.name.partition(".")[0] for alias in node.names if not alias.asname
-            }
-            local |= tops | {alias.asname: alias.name for alias in node.names if alias.asname}
-        elif isinstance(node, ast.ImportFrom):
-            local |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
-    names = {node.name for each in ast.walk(tree) if isinstance(each, ast.Import) for node in each.names} | {
-        *local.values()
-    }
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            name = f"{node.module}.{alias.name}" if isinstance(node, ast.ImportFrom) else alias.name
+            names.add(name)
+            whole = alias.asname or isinstance(node, ast.ImportFrom)
+            local[alias.asname or alias.name.partition(".")[0]] = name if whole else name.partition(".")[0]
+    inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and node not in inner:
             head, _, rest = ast.unparse(node).partition(".")
