@@ -69,8 +69,19 @@ def run(args: argparse.Namespace) -> None:
     names, example = _ARGUMENTS[args.function], np.asarray(jd.neutral(scene.system), float)
     rest = np.zeros(scene.system.nv)
     name = args.function if args.name is None else args.name
+    system, function = scene.system, getattr(jd, args.function)
+    # The C header takes its argument names from the signature, so `*args` would not do.
+    wrappers: dict[tuple[str, ...], Callable] = {
+        ("q", "v", "tau"): lambda q, v, tau: function(system, q, v, tau),
+        ("q", "v", "a"): lambda q, v, a: function(system, q, v, a),
+        ("q", "v"): lambda q, v: function(system, q, v),
+        ("q",): lambda q: function(system, q),
+    }
+    if args.function == "constrained_dynamics":
+        # An exported function returns one array; the result of the library holds more.
+        wrappers[names] = lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration
     exported = jd.export(
-        _function_of(scene, args.function),
+        wrappers[names],
         *(example if x == "q" else rest for x in names),
         name=name,
         derivatives=("jacobian",) if args.jacobian else (),
@@ -80,20 +91,3 @@ def run(args: argparse.Namespace) -> None:
     # The folder may hold exports of other names.
     files = ", ".join(sorted(x.name for x in folder.iterdir() if x.name.startswith(name)))
     print(f"{exported} for {args.target}, in {folder}: {files}")
-
-
-def _function_of(scene, name: str) -> Callable:
-    """Function of arrays only, with the parameter names of the C header."""
-    system = scene.system
-    if name == "constrained_dynamics":
-        # An exported function returns one array; the result of the library holds more.
-        return lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration
-    function = getattr(jd, name)
-    # The C header takes its argument names from the signature, so `*args` would not do.
-    wrappers: dict[tuple[str, ...], Callable] = {
-        ("q", "v", "tau"): lambda q, v, tau: function(system, q, v, tau),
-        ("q", "v", "a"): lambda q, v, a: function(system, q, v, a),
-        ("q", "v"): lambda q, v: function(system, q, v),
-        ("q",): lambda q: function(system, q),
-    }
-    return wrappers[_ARGUMENTS[name]]

@@ -31,7 +31,9 @@ def error_table(findings: Findings) -> str:
     labels = columns_of(findings.model).v
     rows = []
     for kind, group in (("test", findings.tests), ("fitted", findings.train)):
-        rows += [[one.name, kind, f"{one.percent:.2f}", *_each(one.percent_by_joint)] for one in group]
+        for one in group:
+            each = [f"{x:.1f}" if np.isfinite(x) else "-" for x in one.percent_by_joint]
+            rows.append([one.name, kind, f"{one.percent:.2f}", *each])
     text = (
         f"torque error: {total_percent(findings.tests):.2f} % on test data, {total_percent(findings.train):.2f} % on "
         f"training data; {total_percent(findings.tests, 'nominal'):.1f} % with the URDF's parameters\n"
@@ -62,10 +64,6 @@ def tables(findings: Findings) -> str:
         parts += [_robot_base_table(result, model)]
     parts.append(_mass_table(findings))
     return "\n".join(parts)
-
-
-def _each(values: np.ndarray) -> list[str]:
-    return [f"{x:.1f}" if np.isfinite(x) else "-" for x in values]
 
 
 def _joint_table(findings: Findings) -> str:

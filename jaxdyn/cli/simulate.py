@@ -222,7 +222,11 @@ def _excitation(scene: LoadedScene, args):
         raise ValueError(f"--start is {args.start!r}; the named states are {', '.join(scene.starts)}")
     model, start = scene.system, scene.starts[args.start]
     q0, v0, duration = np.asarray(start.q), np.asarray(start.v), 2.0
-    size = _torque_size(model, args)
+    limit = np.asarray(model.effort_limit)
+    # Files without limits have infinity or 0 there.
+    size = jnp.asarray(np.where(np.isfinite(limit) & (limit > 0), 0.01 * limit, 1.0))
+    if args.torque_size is not None:
+        size = jnp.asarray(per_coordinate(model, args.torque_size, "--torque-size"))
     if args.torque in _KINDS:
         # Zeros and not another control: every kind of torque shares one code path.
         random = size if "random" in args.torque else 0 * size
@@ -248,14 +252,6 @@ def _excitation(scene: LoadedScene, args):
     q0 = q0 if args.q0 is None else vector(model, args.q0, q0, "--q0")
     v0 = v0 if args.v0 is None else vector(model, args.v0, v0, "--v0")
     return control, q0, v0, duration
-
-
-def _torque_size(model: Model, args) -> jax.Array:
-    if args.torque_size is not None:
-        return jnp.asarray(per_coordinate(model, args.torque_size, "--torque-size"))
-    limit = np.asarray(model.effort_limit)
-    # Files without limits have infinity or 0 there.
-    return jnp.asarray(np.where(np.isfinite(limit) & (limit > 0), 0.01 * limit, 1.0))
 
 
 def _starts(scene: Scene, q0, v0, args) -> tuple[jax.Array, jax.Array]:
@@ -320,11 +316,8 @@ def _summarise(model: Model, solution: Solution, done: np.ndarray) -> None:
         f"energy minus work of torques and friction: at most {drift:.2e} J from its initial value, "
         f"for {exchanged:.4g} J exchanged"
     )
-    outside = _outside(model, np.asarray(solution.q)[done])
-    if outside:
-        print(f"joints beyond their limits during the motion (limits are not enforced): {', '.join(outside)}")
-
-
-def _outside(model: Model, q: np.ndarray) -> list[str]:
+    q = np.asarray(solution.q)[done]
     far = np.any((q < np.asarray(model.lower)) | (q > np.asarray(model.upper)), axis=(0, 1))
-    return [name for name, place in zip(model.joint_names, model.topology.q_slices, strict=True) if far[place].any()]
+    names = zip(model.joint_names, model.topology.q_slices, strict=True)
+    if outside := [name for name, place in names if far[place].any()]:
+        print(f"joints beyond their limits during the motion (limits are not enforced): {', '.join(outside)}")
