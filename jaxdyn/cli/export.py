@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 import jaxdyn as jd
-from jaxdyn.cli.common import FILE, add_model_options, load_scene
+from jaxdyn.cli.common import FILE, add_model_options, load_scene, option
 from jaxdyn.exports.exported import ABIS, HOST, TARGETS
 
 HELP = "write a function of a robot as an object file for C or CasADi"
@@ -46,19 +46,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="forward_dynamics",
         help="function to export (default: forward_dynamics)",
     )
-    parser.add_argument("--name", help="name of the C function (default: that of --function)")
-    parser.add_argument(
-        "--jacobian", action="store_true", help="add the Jacobians of the result with respect to each argument"
-    )
-    parser.add_argument("--batch", action="store_true", help="add a vectorised function of many samples")
-    parser.add_argument("--out", metavar="FOLDER", required=True, help="output folder, created if missing")
-    parser.add_argument(
-        "--target",
+    option(parser, "--name NAME", "name of the C function (default: that of --function)")
+    option(parser, "--jacobian", "add the Jacobians of the result with respect to each argument")
+    option(parser, "--batch", "add a vectorised function of many samples")
+    option(parser, "--out FOLDER", "output folder, created if missing", required=True)
+    option(
+        parser,
+        "--target TARGET",
+        f"target platform: {HOST}, {', '.join(TARGETS)}, or an LLVM triple (default: {HOST})",
         default=HOST,
-        help=f"target platform: {HOST}, {', '.join(TARGETS)}, or an LLVM triple (default: {HOST})",
     )
-    parser.add_argument("--cpu", help="processor in LLVM's notation, such as cortex-a72")
-    parser.add_argument("--features", help="processor features in LLVM's notation, such as +neon")
+    option(parser, "--cpu CPU", "processor in LLVM's notation, such as cortex-a72")
+    option(parser, "--features FEATURES", "processor features in LLVM's notation, such as +neon")
     parser.add_argument("--abi", choices=ABIS, default="c", help="calling interface (default: c)")
 
 

@@ -16,6 +16,7 @@ from jaxdyn.cli.common import (
     connect,
     load_for_repair,
     load_model,
+    option,
     output_path,
     real,
     whole,
@@ -77,43 +78,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command: those of daily use first, the rest as "advanced"."""
     # The generated usage would list all options, and a user needs two of them.
     parser.usage = "%(prog)s --urdf ROBOT.urdf --log FILE ... [options]"
-    # A repeated option extends its list: shells expand one pattern per option.
-    several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
-    parser.add_argument("--urdf", metavar="FILE", help="robot; its geometry is fixed, its inertias are the prior")
-    parser.add_argument("--log", **several, metavar="FILE", help="training logs, .csv or .npz")
-    parser.add_argument("--test-log", **several, metavar="FILE", help="test logs (default: the end of every log)")
-    parser.add_argument("--out", metavar="FILE", help="write the fitted robot, .urdf; also the report")
-    parser.add_argument("--report", metavar="FILE", help="write parameters and errors, .json (default: next to --out)")
-    parser.add_argument("--html", metavar="FILE", help="write a page with tables and plots, .html")
-    parser.add_argument("--progress", action="store_true", help="print trials and the loss while fitting")
-    _add_expert_options(
-        parser.add_argument_group("advanced: data"), parser.add_argument_group("advanced: fit"), several
-    )
-    add_model_options(parser, "advanced: model")
-
-
-def _add_expert_options(data, fit, several: dict[str, Any]) -> None:
-    data.add_argument("--payload-log", **several, metavar="FILE", help="logs of the same robot with a payload")
-    data.add_argument("--payload-body", metavar="LINK", help="link with the payload (default: the last)")
-    data.add_argument("--payload-mass", type=real, metavar="KG", help="known payload mass: also fit drive gains")
-    data.add_argument(
-        "--payload-centre", nargs=3, type=real, metavar=("X", "Y", "Z"), help="known centre of mass in LINK, m"
-    )
-    data.add_argument("--rename", **several, metavar="NAME=JOINT", help="names of joints in the logs")
-    data.add_argument("--train", type=real, default=0.7, metavar="SHARE", help="training share (default: 0.7)")
-    data.add_argument("--cutoff", default="auto", metavar="HZ", help="low-pass frequency (default: auto, by spectra)")
-    data.add_argument(
-        "--every", type=whole, metavar="N", help="keep one of N samples (default: 15 per period of --cutoff)"
-    )
-    data.add_argument("--trim", type=whole, metavar="N", help="samples to drop at each end (default: 38 * --every)")
-    data.add_argument("--filtered", action="store_true", help="the logs are filtered already")
-    data.add_argument(
-        "--unwrap", choices=("auto", "yes", "no"), default="auto", help="angles that jump by turns (default: auto)"
-    )
-    data.add_argument(
-        "--outliers", choices=("refuse", "drop", "keep"), default="refuse", help="corrupted samples (default: refuse)"
-    )
-    fit.add_argument("--method", choices=METHODS, metavar="M", default="feasible", help=f"{', '.join(METHODS)}")
+    option(parser, "--urdf FILE", "robot; its geometry is fixed, its inertias are the prior")
+    option(parser, "--log FILE ...", "training logs, .csv or .npz", action="extend")
+    option(parser, "--test-log FILE ...", "test logs (default: the end of every log)", action="extend")
+    option(parser, "--out FILE", "write the fitted robot, .urdf; also the report")
+    option(parser, "--report FILE", "write parameters and errors, .json (default: next to --out)")
+    option(parser, "--html FILE", "write a page with tables and plots, .html")
+    option(parser, "--progress", "print trials and the loss while fitting")
+    data, fit = (parser.add_argument_group(f"advanced: {part}") for part in ("data", "fit"))
+    option(data, "--payload-log FILE ...", "logs of the same robot with a payload", action="extend")
+    option(data, "--payload-body LINK", "link with the payload (default: the last)")
+    option(data, "--payload-mass KG", "known payload mass: also fit drive gains", real)
+    option(data, "--payload-centre X Y Z", "known centre of mass in LINK, m", real)
+    option(data, "--rename NAME=JOINT ...", "names of joints in the logs", action="extend")
+    option(data, "--train SHARE", "training share (default: 0.7)", real, 0.7)
+    option(data, "--cutoff HZ", "low-pass frequency (default: auto, by spectra)", default="auto")
+    option(data, "--every N", "keep one of N samples (default: 15 per period of --cutoff)", whole)
+    option(data, "--trim N", "samples to drop at each end (default: 38 * --every)", whole)
+    option(data, "--filtered", "the logs are filtered already")
+    option(data, "--unwrap {auto,yes,no}", "angles that jump by turns (default: auto)", default="auto")
+    option(data, "--outliers {refuse,drop,keep}", "corrupted samples (default: refuse)", default="refuse")
+    option(fit, "--method M", f"{', '.join(METHODS)}", default="feasible", choices=METHODS)
     fit.add_argument(
         "--terms",
         nargs="*",
@@ -121,19 +106,16 @@ def _add_expert_options(data, fit, several: dict[str, Any]) -> None:
         metavar="TERM",
         help=f"auto, {', '.join((*TERMS, *EXTRA))}",
     )
-    fit.add_argument("--v-s", default="auto", metavar="V", help="smoothing of Coulomb friction, rad/s (default: auto)")
-    fit.add_argument("--prior", default="auto", metavar="W", help="weight of the prior (default: auto)")
-    fit.add_argument(
-        "--weights", choices=("auto", "none"), default="auto", help="of joints: auto, by residuals (default); none"
-    )
-    fit.add_argument("--robust", default="auto", metavar="K", help="Huber threshold, or none (default: auto)")
-    fit.add_argument(
-        "--delay", nargs="+", default=["none"], metavar="S", help="torque delay: seconds, auto, none (default: none)"
-    )
-    fit.add_argument("--horizon", type=real, default=0.25, metavar="S", help="of trajectory segments (default: 0.25)")
-    fit.add_argument("--steps", type=whole, default=100, metavar="N", help="of the trajectory fit (default: 100)")
+    option(fit, "--v-s V", "smoothing of Coulomb friction, rad/s (default: auto)", default="auto")
+    option(fit, "--prior W", "weight of the prior (default: auto)", default="auto")
+    option(fit, "--weights {auto,none}", "of joints: auto, by residuals (default); none", default="auto")
+    option(fit, "--robust K", "Huber threshold, or none (default: auto)", default="auto")
+    option(fit, "--delay S ...", "torque delay: seconds, auto, none (default: none)", default=["none"])
+    option(fit, "--horizon S", "of trajectory segments (default: 0.25)", real, 0.25)
+    option(fit, "--steps N", "of the trajectory fit (default: 100)", whole, 100)
     add_cluster_options(fit)
-    fit.add_argument("--repair", action="store_true", help="replace unphysical and missing inertias first")
+    option(fit, "--repair", "replace unphysical and missing inertias first")
+    add_model_options(parser, "advanced: model")
 
 
 @on_one_thread

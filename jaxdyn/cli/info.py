@@ -8,7 +8,7 @@ import warnings
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.cli.common import FILE, add_model_options, load_scene, output_path, short, table, xacro_arguments
+from jaxdyn.cli.common import FILE, add_model_options, load_scene, option, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.branches import count_free
@@ -48,10 +48,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("file", help=FILE)
     add_model_options(parser)
-    parser.add_argument(
-        "--repair",
-        metavar="OUT.urdf",
-        help="write a URDF with faulty inertias replaced by physical ones close to them (merged links stay merged)",
+    option(
+        parser,
+        "--repair OUT.urdf",
+        "write a URDF with faulty inertias replaced by physical ones close to them (merged links stay merged)",
     )
 
 
