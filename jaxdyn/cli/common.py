@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from jaxdyn.constraints.loops import Loop
 from jaxdyn.io import LoadedScene, formats, urdf_inertia_report
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import inertia
@@ -139,6 +140,12 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     if args.gravity is not None:
         scene = eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity)))
     return scene, file
+
+
+def load_mechanism(path: str, args) -> LoadedScene | None:
+    """Scene of a file that has loops; None for a tree."""
+    scene, _ = load_scene(path, args)
+    return scene if any(isinstance(constraint, Loop) for constraint in scene.constraints) else None
 
 
 def _lock(args: argparse.Namespace) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from jaxdyn.cli.common import (
     add_model_options,
     check_least,
     check_memory,
+    load_mechanism,
     load_model,
     option,
     output_path,
@@ -19,7 +20,6 @@ from jaxdyn.cli.common import (
     table,
     whole,
 )
-from jaxdyn.cli.identify_mechanism import load_mechanism
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import TERMS
 from jaxdyn.identify.excitation_search import OBJECTIVES

@@ -15,13 +15,13 @@ from jaxdyn.cli.common import (
     check_least,
     connect,
     load_for_repair,
+    load_mechanism,
     load_model,
     option,
     output_path,
     real,
     whole,
 )
-from jaxdyn.cli.identify_mechanism import load_mechanism, run_mechanism
 from jaxdyn.cli.identify_options import (
     filter_log,
     find_gains,
@@ -33,14 +33,16 @@ from jaxdyn.cli.identify_options import (
     raw_log,
     resolve_options,
 )
-from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
+from jaxdyn.cli.identify_tables import error_table, gains_text, mechanism_text, payload_text, tables
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
+from jaxdyn.identify.applied_fits import fit_mechanism
 from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.linear_fit import base_terms
 from jaxdyn.identify.raw_logs import check_log_content, check_rest, vibration
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.io import save_urdf
+from jaxdyn.io.loaded import LoadedScene
 from jaxdyn.io.urdf_write import write_text
 from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model, inertia_report, repair_inertias
@@ -204,7 +206,7 @@ def run(args: argparse.Namespace) -> None:
         tests=_evaluate(model, judge, test_names, tests),
         train=_evaluate(model, judge, names[: len(logs)], trained),
         final=_evaluate(model, final, names[: len(logs)], logs),
-        outcome=_outcome(final),
+        outcome=_outcome(fit),
         is_refit=not test_paths,
         warnings=[],
         identifiability=identify.identifiability(model, logs, base_terms(fit.terms), v_s=v_s),
@@ -220,8 +222,8 @@ def run(args: argparse.Namespace) -> None:
     lines += [*(f"warning: {line}" for line in findings.warnings), tables(findings)]
     text = "\n".join(lines)
     print(text)
-    if out is not None and not isinstance(final, LeastSquares):
-        save_urdf((final.fit if isinstance(final, RobotFit) else final).model, out, torques=_extra_torques(final))
+    if out is not None and not isinstance(fit, LeastSquares):
+        save_urdf(fit.model, out, torques=_extra_torques(fit))
         print(f"Wrote {out}.")
     payload = None
     if isinstance(final, RobotFit) and args.payload_log:
@@ -242,9 +244,8 @@ def run(args: argparse.Namespace) -> None:
         print(f"Wrote {html}.")
 
 
-def _extra_torques(result: RobotFit | Fit) -> dict[str, dict[str, float]]:
+def _extra_torques(fit: Fit) -> dict[str, dict[str, float]]:
     """Torque parameters that URDF lacks, of joints with one coordinate: offsets, smoothing velocity, extra terms."""
-    fit = result.fit if isinstance(result, RobotFit) else result
     model = fit.model
     named: dict[str, Any] = {"offset": fit.friction.offset, "v_s": np.full(model.nv, float(fit.friction.v_s))}
     if fit.extra is not None:
@@ -275,10 +276,9 @@ def _settings(args, cutoff: float | None) -> dict[str, Any]:
     }
 
 
-def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
-    if isinstance(result, LeastSquares):
-        return f"{len(result.values)} base parameters, {result.rank} excited, condition {result.condition:.4g}"
-    fit = result.fit if isinstance(result, RobotFit) else result
+def _outcome(fit: Fit | LeastSquares) -> str:
+    if isinstance(fit, LeastSquares):
+        return f"{len(fit.values)} base parameters, {fit.rank} excited, condition {fit.condition:.4g}"
     return f"{name_of(fit.result).replace('_', ' ')} after {len(fit.history) - 1} steps"
 
 
@@ -312,3 +312,84 @@ def _warnings(findings: Findings) -> list[str]:
                 f"the band of the motion, beyond rigid-body dynamics: vibration; {fix}"
             )
     return lines
+
+
+# --- mechanisms with loops, from logs of their motors alone ---
+
+
+# Configurations between the one of the file and the first sample, so that the loops stay on their branch.
+_APPROACH = 50
+
+
+def run_mechanism(scene: LoadedScene, args) -> None:
+    """Fit, print errors and combinations of parameters, write the report."""
+    unsupported = {
+        "--out": args.out,
+        "--html": args.html,
+        "--payload-log": args.payload_log,
+        "--repair": args.repair,
+        "--method": args.method if args.method != "feasible" else None,
+        "--delay": args.delay if args.delay != ["none"] else None,
+        "--robust": args.robust if args.robust != "auto" else None,
+    }
+    if given := [name for name, value in unsupported.items() if value]:
+        raise ValueError(f"{', '.join(given)}: not for a mechanism with loops, {pathlib.Path(args.urdf).name}; omit it")
+    json_path = output_path(args.report, (".json",), "--report")
+    terms = TERMS if args.terms in (None, ["auto"]) else tuple(args.terms)
+    v_s, prior = (x if value == "auto" else float(value) for value, x in ((args.v_s, 0.01), (args.prior, 1.0)))
+    train_paths, test_paths = log_paths(args)
+    names = log_names(train_paths + test_paths)
+    raws = [raw_log(scene.system, path, args, motors=True) for path in train_paths + test_paths]
+    motors = raws[0].joint_names or ()
+    cutoff = log_cutoff(raws[: len(train_paths)], args)
+    logs = [
+        _complete(scene, filter_log(raw, path, args, cutoff), motors, path)
+        for raw, path in zip(raws, train_paths + test_paths, strict=True)
+    ]
+    train, test = logs[: len(train_paths)], logs[len(train_paths) :]
+    if not test:
+        train, test = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
+    judge = fit_mechanism(scene, train, motors, terms, v_s=v_s, prior=prior)
+    final = judge if test_paths else fit_mechanism(scene, logs, motors, terms, v_s=v_s, prior=prior)
+    tested = names[len(train_paths) :] or [f"{name} (last {100 * (1 - args.train):.3g} %)" for name in names]
+    print(
+        mechanism_text(scene, judge, final, dict(zip(tested, test, strict=True)), dict(zip(names, train, strict=False)))
+    )
+    if json_path is not None:
+        report = {
+            "file": str(args.urdf),
+            "motors": list(motors),
+            "outcome": name_of(final.fit.result),
+            "test_percent": {name: judge.fit.error(log) for name, log in zip(tested, test, strict=True)},
+            "condition": final.condition,
+            "weakest": [direction._asdict() for direction in final.weakest],
+            "interval_factor": final.factor,
+            "base_parameters": {
+                "expressions": list(final.base.expressions),
+                "nominal": final.nominal.tolist(),
+                "fitted": final.values.tolist(),
+                "std": [float(x) if np.isfinite(x) else None for x in final.std],
+            },
+            "parameters": dict(zip(final.fit.names, final.fit.values.tolist(), strict=True)),
+        }
+        write_text(json_path, json.dumps(report, indent=2) + "\n")
+        print(f"Wrote {json_path}.")
+
+
+def _complete(scene: LoadedScene, log: Log, motors: tuple[str, ...], path: str) -> Log:
+    """Log of all joints, from those of the motors and the loops, on the branch of the file's placement."""
+    model, start = scene.system, scene.starts["reference"].q
+    places = [model.q_index(name) for name in motors]
+    t, q, v, a = (np.asarray(x, np.float64) for x in (log.t, log.q, log.v, log.a))
+    approach = np.linspace(np.asarray(start)[places], q[0], _APPROACH, endpoint=False)
+    # The approach is a motion without velocity before the log, by whole seconds.
+    before = np.arange(-_APPROACH, 0) + t[0]
+    rest, tau = np.zeros_like(approach), np.zeros((_APPROACH + len(log), model.nv))
+    tau[_APPROACH:, [model.v_index(name) for name in motors]] = log.tau
+    joined = [np.concatenate(pair) for pair in ((approach, q), (rest, v), (rest, a))]
+    measured = {name: tuple(x[:, i] for x in joined) for i, name in enumerate(motors)}
+    try:
+        whole = identify.complete_log(scene, np.concatenate([before, t]), measured, tau, start)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return whole[_APPROACH:]
