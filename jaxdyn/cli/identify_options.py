@@ -13,6 +13,7 @@ from jaxdyn import identify
 from jaxdyn.cli.common import number
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.log_repair import repair_log
+from jaxdyn.identify.raw_logs import differentiate
 from jaxdyn.identify.torque_terms import LEAVES
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.tree import Model
@@ -123,10 +124,10 @@ def filter_log(raw: Log, path: str, args, cutoff: float | None) -> Log:
         print(f"{span}, with v and a: used as filtered")
         return raw
     if args.filtered:
-        print(f"{span}, used as filtered; missing v and a are computed by differences")
-        # A filtered signal is smooth enough for central differences.
-        v = np.gradient(np.asarray(raw.q), np.asarray(raw.t), axis=0) if raw.v is None else raw.v
-        a = np.gradient(np.asarray(v), np.asarray(raw.t), axis=0)
+        print(f"{span}, used as filtered; missing v and a are those of splines")
+        t = np.asarray(raw.t, np.float64)
+        v = differentiate(t, np.asarray(raw.q, np.float64)) if raw.v is None else raw.v
+        a = differentiate(t, np.asarray(v, np.float64))
         return Log(raw.t, raw.q, v, a, raw.tau, joint_names=raw.joint_names)
     # The mean rate, because sampling may jitter.
     rate = (len(raw) - 1) / float(raw.t[-1] - raw.t[0])

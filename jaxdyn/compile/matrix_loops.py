@@ -290,7 +290,7 @@ class LoopWriter:
             for place, offset in zip(places, offsets, strict=True):
                 b.store(zero if start is None else self._load_vector(start, offset), place)
             with self.loop(begin, end) as k:
-                k = b.load(b.gep(indices, [k]), typ=INT) if is_long else k  # pyright: ignore[reportPossiblyUnboundVariable]
+                k = b.load(b.gep(indices, [k]), typ=INT) if is_long else k
                 factor = self.load(self.at(factors, (k, of_factor)))
                 with b.if_then(b.fcmp_unordered("!=", factor, self.number(0))):
                     each, row = self._splat(factor), self.at(rows.memory, (k, rows.stride))

@@ -134,7 +134,8 @@ class HeightField(Surface):
 
     def _on_grid(self, xy, order: int):
         """Derivatives (order + 1, order + 1), of i-th order along x and of j-th along y, by the products of splines."""
-        spacing, origin, c = (x.astype(xy.dtype) for x in (self.spacing, self.origin, self.coefficients))  # pyright: ignore
+        assert self.spacing is not None and self.origin is not None and self.coefficients is not None
+        spacing, origin, c = (x.astype(xy.dtype) for x in (self.spacing, self.origin, self.coefficients))
         ends = jnp.asarray(np.array(c.shape) - 1 - 2 * self.smooth, xy.dtype)
         # In units of the grid. Beyond it the height of the edge continues.
         place = (xy - origin) / spacing

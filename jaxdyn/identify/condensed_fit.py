@@ -166,7 +166,10 @@ def fit_blocks(
     free = condense_rows(rows[:, [*places, *range(data.basic), size]], count)
     spare = count - free.R.shape[1]
     # Dependent columns make this estimate a little too small, alike for all settings that are compared.
-    sigma = np.sqrt(free.rest / spare) if is_rough and spare > 0 and free.rest > 0 else noise_level(free)
+    if is_rough and spare > 0 and free.rest > 0:
+        sigma = np.sqrt(free.rest / spare)
+    else:
+        sigma = noise_level(free, what="the part of the log that settings are compared by" if is_rough else "the log")
     rows = np.concatenate([free.R, free.d[:, None]], axis=1)
     # The residual of all columns is one more row, so that the eliminated triangle keeps the loss and not only its minimiser.
     rows = np.concatenate([rows, np.append(np.zeros(free.R.shape[1]), np.sqrt(free.rest))[None]])

@@ -36,7 +36,7 @@ from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.arguments import Numbers, deprecated, warn
 from jaxdyn.model.tree import Model
 
-# Most Gauss-Newton steps.
+# Most evaluations of the errors.
 _STEPS = 50
 # Largest half-width of a 95 % interval, as a share of the gain, of an identifiable gain.
 _IDENTIFIABLE = 0.5
@@ -111,7 +111,8 @@ def fit_gains(
 
     **Returns:** `DriveGains`.
 
-    **Raises:** ValueError when logs and model do not fit together, for an unknown body, and where the payload identifies no gain.
+    **Raises:** ValueError when logs and model do not fit together, for an unknown body, for fewer
+    samples than unknowns of a joint, and where the payload identifies no gain.
 
     Source: Gautier & Briot (2014), "Global identification of joint drive gains and dynamic parameters of robots", ASME Journal of
     Dynamic Systems, Measurement, and Control 136; errors here are those of the currents, which least squares over both allows.
@@ -211,6 +212,11 @@ def _fit(problem: _Problem, v_s: float):
     """Score, error in per cent, gains, standard deviations, factor of an interval, v_s, and the result."""
     data, nv = problem.data, problem.nv
     triangles, samples = data.merge(), int(data.samples.sum())
+    # A joint whose rows are fitted exactly shows no error, and its weight, one over it, would decide everything.
+    if samples <= (unknowns := 1 + max(map(len, problem.unknowns))):
+        raise ValueError(
+            f"the logs have {samples} samples, too few for the {unknowns} unknowns of a joint and its gain; log more samples"
+        )
     sizes = np.array([max(float(np.linalg.norm(R[:, -1])), 1e-300) for R in triangles])
     start = _start(problem, triangles)
     state = _State(np.zeros(problem.size), start, 1 / sizes)
@@ -218,7 +224,7 @@ def _fit(problem: _Problem, v_s: float):
     for _ in range(MOST_ROUNDS):
         # Weights depend on the errors of the fit and the fit on the weights: iterated.
         before = np.concatenate([state.z, state.u])
-        state, has_converged = _descend(problem, triangles, state, start)
+        state, has_converged = _minimise(problem, triangles, state, start)
         rms = np.array(
             [np.linalg.norm(problem.rows(j, R, state.z, state.u[j])[0]) for j, R in enumerate(triangles)]
         ) / np.sqrt(samples)
@@ -282,37 +288,25 @@ def _start(problem: _Problem, triangles) -> np.ndarray:
     return np.where(np.isnan(logarithms), np.nanmedian(logarithms), logarithms)
 
 
-def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> tuple[_State, bool]:
-    """Make Gauss-Newton steps in unknowns and gains, the first in the unknowns alone; halved until the loss decreases.
+def _minimise(problem: _Problem, triangles, state: _State, start: np.ndarray) -> tuple[_State, bool]:
+    """The state of least squares at the weights of a state, by Levenberg and Marquardt's method, and whether it is a minimum."""
+    from scipy.optimize import least_squares
 
-    **Returns:** the state, and whether it is a minimum.
-    """
-    z, u, weights = state
+    size = problem.size
 
-    def loss(z, u) -> float:
-        error, _ = problem.linearise(triangles, z, u, weights)
-        return float(error @ error + np.sum((u - start) ** 2) / _APART**2)
+    def errors(y):
+        error, _ = problem.linearise(triangles, y[:size], y[size:], state.weights)
+        return np.append(error, (y[size:] - start) / _APART)
 
-    z, now = z.copy(), np.inf
-    for step in range(_STEPS):
-        error, J = problem.linearise(triangles, z, u, weights)
-        root = np.sqrt(_weak_prior(J.T @ J, problem.size))
-        pull = np.concatenate([np.zeros(problem.size), (u - start) / _APART])
-        A, b = np.concatenate([J, np.diag(root)]), np.concatenate([error, pull])
-        if step == 0:  # the errors are linear in the unknowns at fixed gains
-            A = A[:, : problem.size]
-        # Unit columns: the test of the rank must not depend on units.
-        scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
-        change = -np.linalg.lstsq(A / scale, b, rcond=_RANK)[0] / scale
-        # What the linear model promises. Errors have deviations of one from the second round on, and in no direction does a
-        # promise of 1e-8 move the unknowns by more than 1e-4 of their deviation.
-        if step and np.sum((A @ change) ** 2) <= max(1e-12 * now, 1e-8):
-            return state._replace(z=z, u=u), True
-        dz, du = change[: problem.size], change[problem.size :] if step else np.zeros(problem.nv)
-        share = 1.0
-        while (after := loss(z + share * dz, u + share * du)) > now and share > 1e-6:
-            share /= 2
-        if after > now:
-            break
-        z, u, now = z + share * dz, u + share * du, after
-    return state._replace(z=z, u=u), False
+    def jacobian(y):
+        _, J = problem.linearise(triangles, y[:size], y[size:], state.weights)
+        return np.concatenate([J, np.eye(len(y))[size:] / _APART])
+
+    # At fixed gains the errors are linear in the other unknowns.
+    zero = np.append(np.zeros(size), state.u)
+    z = -np.linalg.lstsq(jacobian(zero)[:, :size], errors(zero), rcond=_RANK)[0]
+    # Columns of unit length ("jac"): neither steps nor the test for their end may depend on units.
+    options: dict[str, Any] = {"jac": jacobian, "method": "lm", "x_scale": "jac", "max_nfev": _STEPS}
+    options |= {"ftol": 1e-12, "xtol": 1e-10, "gtol": 1e-14}
+    end: Any = least_squares(errors, np.append(z, state.u), **options)
+    return state._replace(z=end.x[:size], u=end.x[size:]), bool(end.success)

@@ -161,7 +161,7 @@ class DrivenRobot(eqx.Module):
 
     @property
     def model(self) -> Model:
-        return self.scene.system  # pyright: ignore[reportReturnType]
+        return self.scene.system
 
     @property
     def joints(self) -> np.ndarray:

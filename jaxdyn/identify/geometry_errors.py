@@ -67,7 +67,7 @@ class Mechanism(NamedTuple):
     @property
     def places(self) -> tuple[str, ...]:
         """Names of the twists: of the base, of the joints, of the tool, and two for each loop."""
-        loops = [f"{self.scene.constraints[k].name} {end}" for k in self.loops for end in "ab"]  # pyright: ignore
+        loops = [f"{self.scene.constraints[k].name} {end}" for k in self.loops for end in "ab"]
         return ("base", *(self.model.joint_names[i] for i in self.bodies), "tool", *loops)
 
     @property
@@ -86,7 +86,7 @@ def make_mechanism(system: Any, frame: str, measured: Sequence[str] | None) -> M
     loops = tuple(k for k, constraint in enumerate(scene.constraints) if isinstance(constraint, Loop))
     if len(loops) < len(scene.constraints):
         raise ValueError("the scene has constraints other than loops (jd.loop); geometry is fitted with loops alone")
-    ends = [end for k in loops for end, _ in scene.constraints[k].ends() if end is not None]  # pyright: ignore
+    ends = [end for k in loops for end, _ in scene.constraints[k].ends() if end is not None]
     bodies: set[int] = set()
     for tip in (body, *(model.topology.frame_bodies[frame_index(model, end)] for end in ends)):
         while tip >= 0:
@@ -141,7 +141,7 @@ class Measurements(NamedTuple):
 def tip_errors(mechanism: Mechanism, data: Measurements, twists, q, seen):
     """Errors of one measurement `seen`: position (m) and rotation (rad) of the frame (6,), or positions of the markers (3 k,)."""
     scene = change_scene(mechanism, twists)
-    pose = data.base @ se3.exp(twists[0]) @ frame_pose(scene.system, q, mechanism.frame)  # pyright: ignore
+    pose = data.base @ se3.exp(twists[0]) @ frame_pose(scene.system, q, mechanism.frame)
     pose = pose @ data.tool @ se3.exp(twists[mechanism.tool])
     if data.poses is None:
         return (data.markers @ pose[:3, :3].T + pose[None, :3, 3] - seen).reshape(-1)

@@ -140,24 +140,24 @@ def filter_like_log(log: Log, columns: np.ndarray, order: int = 4, factor: int =
     cutoff = log.cutoff
     if cutoff is None or not _has_filter(log, order):
         return columns if factor == 1 else columns[::factor]
-    from scipy.signal import butter, filtfilt
-
-    # The refined samples have a higher rate: the cut-off stays the same in Hz.
-    rate = factor * log_rate(log)
-    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
     if not columns.size:
         return columns[::factor]
-    padding = pad_length(rate, cutoff, len(columns))
-    return filtfilt(numerator, denominator, columns, axis=0, padlen=padding)[::factor]
+    # The refined samples have a higher rate: the cut-off stays the same in Hz.
+    return low_pass(columns, factor * log_rate(log), cutoff, order)[::factor]
 
 
-def pad_length(rate: float, cutoff: float, count: int) -> int:
-    """Samples of the extension at both ends of a signal of `count` samples before a low-pass: three periods of the cut-off.
+def low_pass(x: np.ndarray, rate: float, cutoff: float, order: int = 4) -> np.ndarray:
+    """Columns x (n, ...) through a Butterworth filter, forward and backward; sampling rate and half-power frequency in Hz.
 
-    SciPy's default of some fifteen samples is much shorter than the filter's response. With it, accelerations of a motion
-    that does not begin at rest were wrong by a third of their size up to two periods from the ends.
+    Before, both ends are extended by three periods of the cut-off. SciPy's default of some fifteen samples is much shorter
+    than the filter's response. With it, accelerations of a motion that does not begin at rest were wrong by a third of their
+    size up to two periods from the ends.
     """
-    return min(int(3 * rate / cutoff), count - 1)
+    from scipy.signal import butter, filtfilt
+
+    # scipy's annotations leave open what `output` gives.
+    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
+    return filtfilt(numerator, denominator, x, axis=0, padlen=min(int(3 * rate / cutoff), len(x) - 1))
 
 
 def samples_for_jumps(log: Log) -> tuple[Log, int]:
@@ -228,7 +228,8 @@ def _check_signals(signals: dict) -> None:
             row = bad[0][0]
             column = "" if name == "t" else f", column {bad[0][1] + 1}"
             raise ValueError(
-                f"{name} is {np.asarray(value)[tuple(bad[0])]} at row {row}{column} ({len(bad)} such values)"
+                f"{name} is {np.asarray(value)[tuple(bad[0])]} at row {row}{column} ({len(bad)} such values); drop these rows, "
+                "or cut the log there"
             )
     t = np.asarray(signals["t"])
     back = np.flatnonzero(np.diff(t) <= 0)

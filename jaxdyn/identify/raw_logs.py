@@ -16,7 +16,7 @@ from jaxdyn.identify.logs import (
     are_angles,
     idle_coordinates,
     log_rate,
-    pad_length,
+    low_pass,
     root_mean_square,
     travel_ranges,
 )
@@ -46,7 +46,7 @@ def from_raw(
 
     Columns that a recorder has interpolated linearly between rarer samples become splines through these (`spline_lines`). The
     samples are interpolated linearly to a uniform grid of as many samples. q is low-passed forward and backward
-    (Butterworth, zero phase); v is its numerical gradient, low-passed again; a the gradient of v, low-passed again; tau
+    (Butterworth, zero phase); v is the derivative of its spline, low-passed again; a that of v's, low-passed again; tau
     is low-passed the same way, so that both sides of the equation of motion have the same filter. The filter's
     transients at both ends are dropped, and as the signals have no power above the cut-off, only every few samples are
     kept.
@@ -74,8 +74,6 @@ def from_raw(
 
     Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
     """
-    from scipy.signal import butter, filtfilt
-
     for name, value, least in (("order", order, 1), ("trim", trim, 0), ("every", every, 1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}")
@@ -108,20 +106,18 @@ def from_raw(
             f"period of cutoff={cutoff} Hz; cut the log there or lower the cut-off"
         )
     grid = np.linspace(t[0], t[-1], n)
-    # scipy's annotations leave open what `output` gives.
-    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
 
     def uniform(x):
         return np.stack([np.interp(grid, t, column) for column in x.T], axis=1)
 
     def low(x):
-        return filtfilt(numerator, denominator, x, axis=0, padlen=pad_length(rate, cutoff, n))
+        return low_pass(x, rate, cutoff, order)
 
     q, tau = spline_lines(t, q, "positions"), spline_lines(t, tau, "torques")
     positions, torques = low(uniform(q)), low(uniform(tau))
     # A difference amplifies noise in proportion to its frequency: each result goes through the low-pass again.
-    v = low(np.gradient(positions, grid, axis=0))
-    a = low(np.gradient(v, grid, axis=0))
+    v = low(differentiate(grid, positions))
+    a = low(differentiate(grid, v))
     # Decimated after the low-pass: before it, frequencies above half of the new rate would alias.
     keep = slice(trim, n - trim, every)
     return Log(grid[keep], positions[keep], v[keep], a[keep], torques[keep], joint_names=raw.joint_names, cutoff=cutoff)
@@ -140,6 +136,18 @@ _RISE, _SHARE = 10.0, 1e-4
 _LINES = 6
 # Highest cut-off as a share of the sampling rate.
 _SAMPLING = 0.4
+
+
+def differentiate(t: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Rates (n, k) of columns x (n, k), sampled at t (n,): those of the cubic splines through the samples.
+
+    They lower the rate of a sine of angular frequency w, sampled every h, by the share (w h)^4 / 180. Central differences lower
+    it by (w h)^2 / 6, in v and in a of each joint alike, which a fit takes for evidence: of logs without noise at 100 Hz, 70 %
+    of the intervals of 95 % held the truth.
+    """
+    from scipy.interpolate import CubicSpline
+
+    return CubicSpline(t, x)(t, 1)
 
 
 def spline_lines(t: np.ndarray, x: np.ndarray, what: str) -> np.ndarray:
@@ -240,7 +248,7 @@ class _Spectra(NamedTuple):
         q, tau = (np.stack([np.interp(grid, t, column) for column in x.T], axis=1) for x in (q, tau))
         rate = (len(t) - 1) / float(t[-1] - t[0])
         # Differentiate before windowing: a path that does not end at its start would be a jump in the spectrum.
-        frequency, velocity = power(np.gradient(q, grid, axis=0), rate)
+        frequency, velocity = power(differentiate(grid, q), rate)
         return cls(frequency, power(tau, rate)[1], rate, _motion(frequency, power(q, rate)[1], velocity))
 
     def valley(self, motion: float) -> tuple[float, float] | None:

@@ -410,14 +410,18 @@ def group_columns(W: np.ndarray, names: tuple[str, ...], nb: int, dtype: np.dtyp
     return BaseParameters(matrix, independent, names), rank
 
 
-def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:
-    """Root mean square residual of the unconstrained least squares, the torque noise of a condensed log.
+def noise_level(condensed: Condensed, *, what: str = "the log", rcond: float = 1e-9) -> float:
+    """Root mean square residual of the unconstrained least squares, the torque noise of a condensed log; `what`, for the message.
 
     **Raises:** ValueError when the log has no more rows than the regressor's rank: then the noise is not identifiable.
     """
     fit = least_squares_by_svd(condensed.R, condensed.d, rcond)
     if condensed.rows <= fit.rank:
-        raise ValueError(f"the log has {condensed.rows} torques for {fit.rank} unknowns; log more")
+        # Not the number of unknowns: a log of few rows determines as many combinations of them as it has rows.
+        raise ValueError(
+            f"{what} has {condensed.rows} torques, which determine {fit.rank} combinations of parameters and leave no error to "
+            "estimate noise by; log more samples"
+        )
     return float(np.sqrt((condensed.rest + fit.rest) / (condensed.rows - fit.rank)))
 
 

@@ -334,7 +334,7 @@ class Fit(Outcome):
     @property
     def model(self) -> Model:
         """Fitted model, with its inertias, armature, damping and friction."""
-        return self.scene.system  # pyright: ignore[reportReturnType]
+        return self.scene.system
 
     @property
     def friction(self) -> Friction:

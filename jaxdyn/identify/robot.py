@@ -17,6 +17,7 @@ from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed_fit import Estimate, Intervals, Setting
 from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.logs import Log, as_logs
+from jaxdyn.identify.raw_logs import differentiate
 from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_logs import RobotLogs, cross_validation
@@ -138,9 +139,7 @@ def with_delays(
     """
     kept = tuple(int(joint) for joint in np.flatnonzero(delays.seconds))
     # Keyed by identity: the term is called with the problem's own logs, because it is smooth.
-    derivatives = {
-        id(log): -np.gradient(fit.torques(log), np.asarray(log.t, np.float64), axis=0) for log in problem.logs
-    }
+    derivatives = {id(log): -differentiate(np.asarray(log.t, np.float64), fit.torques(log)) for log in problem.logs}
     term = TorqueTerm(_DELAY.name, lambda log, load, v_s: derivatives[id(log)], is_smooth=True)
     wide = problem.with_term(term)
     free = setting._replace(extra=(*setting.extra, (term.name, kept)))
@@ -157,7 +156,7 @@ def _shift_logs(logs: Sequence[Log], delay: np.ndarray) -> tuple[Log, ...]:
 
 
 def _negative_derivative(log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
-    return -np.gradient(np.asarray(log.tau, np.float64), np.asarray(log.t, np.float64), axis=0)
+    return -differentiate(np.asarray(log.t, np.float64), np.asarray(log.tau, np.float64))
 
 
 # The derivative of a low-passed torque has no power above the cut-off either: no refinement is needed.

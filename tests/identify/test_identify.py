@@ -220,7 +220,7 @@ def test_bad_arguments_raise(arm, iiwa_log):
         identify.least_squares(arm, iiwa_log)
     with pytest.raises(ValueError, match="2 samples of 2 torques, too few for 6"):
         identify.least_squares(arm, log[:2], terms=())
-    with pytest.raises(ValueError, match=r"4 torques for .* unknowns; log more"):
+    with pytest.raises(ValueError, match="leave no error to estimate"):
         identify.fit_torques(arm, log[:2])
     with pytest.raises(ValueError, match=r"weights is \[1.0, 0.0\]; give 2 positive"):
         identify.fit_torques(arm, log, weights=[1, 0])

@@ -400,27 +400,29 @@ LEFT_OUT = {
 }
 
 
-def recorded_coverage(kind, seeds):
+def recorded_coverage(kind, seeds, rate=500):
     """Shares of 95 % intervals of base parameters and of friction that hold the truth, over logs of an arm as it is recorded.
 
     Encoders with 2e-5 rad of noise at 500 Hz; torques with 0.01 N m of it at 50 Hz, written as lines between these samples.
-    `kind`: of `LEFT_OUT`, a torque in addition, which no term of the fit explains; "lines" for none.
+    `kind`: of `LEFT_OUT`, a torque in addition, which no term of the fit explains; "lines", none; "exact", nor noise and lines.
     """
+    noise = 0.0 if kind == "exact" else 1.0
     bodies, friction = [], []
     for seed in seeds:
         rng, model, v_s = np.random.default_rng(seed), arm(), 0.02
         x = identify.nominal_parameters(model)
         size = rng.uniform([[0.05], [0.1], [0.005]], [[0.5], [0.5], [0.05]], (3, 2))
         x[20:] = np.concatenate([size[0], size[1], 0.1 * rng.normal(size=2), size[2]])
-        t = np.arange(0, rng.uniform(10, 20), 0.002)
+        t = np.arange(0, rng.uniform(10, 20), 1 / rate)
         q, v, a = random_motion(rng, t)
         W = identify.regressor(model, q, v, a, v_s=v_s)
-        tau = W @ x + 0.01 * rng.normal(size=q.shape)
+        tau = W @ x + noise * 0.01 * rng.normal(size=q.shape)
         tau = tau + (LEFT_OUT[kind](q, v, W[:, :, :20] @ x[:20], v_s) if kind in LEFT_OUT else 0.0)
-        tau = np.stack([np.interp(t, t[::10], column) for column in tau[::10].T], axis=1)
-        q = q + 2e-5 * rng.normal(size=q.shape)
+        if kind != "exact":
+            tau = np.stack([np.interp(t, t[::10], column) for column in tau[::10].T], axis=1)
+        q = q + noise * 2e-5 * rng.normal(size=q.shape)
         cutoff = identify.choose_cutoff(identify.Log(t, q, tau=tau)).frequency
-        every = max(1, int(500 / (15 * cutoff)))
+        every = max(1, int(rate / (15 * cutoff)))
         log = identify.from_raw(t, q, tau, cutoff=cutoff, every=every, trim=38 * every)
         fit = identify.fit_robot(model, log, identify.TERMS, v_s=v_s, prior=1.0, robust=None).intervals
         inside = np.abs(fit.base.values - fit.combinations.values(x)) <= fit.factor * fit.base.std
@@ -436,6 +438,13 @@ def test_intervals_cover_where_torques_are_interpolated():
     """Before lines were replaced by splines 70 % of the intervals of Coulomb friction held the truth."""
     # Of some 40 numbers of each kind, correlated within a log, fewer than 85 % at 95 % are rare.
     assert min(recorded_coverage("lines", range(6))) >= 0.85
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rate", [500, 200, 100])
+def test_intervals_cover_without_noise(rate):
+    """What the preparation of a log changes is all there is; by central differences 70 % of them at 100 Hz held the truth."""
+    assert min(recorded_coverage("exact", range(6), rate)) >= 0.95
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from test_identify_robot import arm, measured, motion
 
 from jaxdyn import identify, inertia
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.identify.logs import pad_length
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.model.builder import ModelBuilder
 
@@ -60,7 +59,7 @@ def test_order_of_the_filter_of_raw_logs():
     q = np.sin(3 * t) + 0.1 * np.sin(60 * t)
     for order in (1, 2, 4):
         log = identify.from_raw(t, q[:, None], q[:, None], cutoff=6.0, order=order, trim=50, every=2, outliers="keep")
-        low = scipy.signal.filtfilt(*scipy.signal.butter(order, 6.0 / 100.0), q, padlen=pad_length(200.0, 6.0, 801))
+        low = scipy.signal.filtfilt(*scipy.signal.butter(order, 6.0 / 100.0), q, padlen=100)
         np.testing.assert_allclose(log.q[:, 0], low[50:-50:2], rtol=0, atol=1e-10)
 
 
