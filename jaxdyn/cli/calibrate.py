@@ -148,14 +148,7 @@ def read_poses(path: str, joints) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(
             f"{file}, line {row + 2}: the quaternion has length {length[row]:.4g}; give unit ones, qw first"
         )
-    rotations = [_rotation(x) for x in quaternions / length[:, None]]
-    return q, np.stack([np.asarray(host_math.pose_of(R, p)) for R, p in zip(rotations, position, strict=True)])
-
-
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation 1 + 2 w hat(u) + 2 hat(u)^2 of a unit quaternion (w, u)."""
-    cross = host_math.hat(quaternion[1:])
-    return np.eye(3) + 2 * quaternion[0] * cross + 2 * cross @ cross
+    return q, np.stack([host_math.joint_pose("free", np.zeros(6), x) for x in np.hstack([position, quaternions])])
 
 
 def _is_number(text: str) -> bool:
