@@ -498,6 +498,13 @@ identify --urdf ARM --log x.csv --every 0 | --every is 0; give at least 1
 identify --urdf ARM --log x.csv --payload-mass 0 | --payload-mass is 0.0; give a positive number
 report four_bar --batch 0 | --batch is 0; give at least 1
 report four_bar --rounds 0 | --rounds is 0; give at least 1
+report | free_body
+report pendulums | pendulums
+report free_body --dtype float16 | float16
+report free_body --integrator Dopri8 | integrators
+report free_body --integrator free:Euler | Euler
+report four_bar free_body --integrator projected:Dopri8 | free_body does not support
+report free_body --integrator fre:Dopri8 | integrators
 sweep x.toml --samples 0 | --samples is 0; give at least 1
 sweep x.toml --workers 0 | --workers is 0; give at least 1
 identify @incomplete.txt | --urdf and --log: missing
@@ -620,35 +627,6 @@ def test_simulate_a_file_with_a_loop(four_bar, folder, run):
     assert max(gaps) < 1e-10
     with pytest.warns(jd.io.NotTakenWarning):
         assert "--start is 'home'; the named states are reference, open" in run(f"{command} --start home", status=2)
-
-
-STUDY = {"scene": '"pendulum"', "out": '"o.zarr"', "samples": "2", "duration": "0.1"}
-
-
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("duration = inf", "duration inf s"),
-        ("duration = [1]", r"duration is \[1\]"),
-        ("points = 1", "points 1;"),
-        ("points = 100000000000000", "points 100000000000000: .* GB of results"),
-        ("samples = 1e3", "samples is 1000.0; see"),
-        ("seed = 100000000000000000000", "seed is 1000"),
-        ("outputs = [1]", r"outputs is \[1\]; give a list of names"),
-        ("parameters = 3", "parameters is 3; see"),
-        ("[options]\nfoo = 1", r"\[options\] foo is 1; options are atol, "),
-        ("[parameters]\nmass = nan", "parameter mass is nan; give a finite number"),
-        ("[parameters]\nmass = { uniform = [1.0, inf] }", "parameter mass is .*inf.*; give a finite number"),
-        ("[parameters]\nmass = { uniform = [1.0, 2.0], size = -1 }", "size is -1; give a whole number"),
-        ("[parameters]\nmass = { uniform = [1.0, 2.0], units = 3 }", "units of mass are 3; give a text"),
-    ],
-)
-def test_numbers_of_a_study_end_in_a_line(line, words, folder, run):
-    pytest.importorskip("zarr")
-    lines = [f"{key} = {value}" for key, value in STUDY.items() if not line.startswith(f"{key} ")]
-    (folder / "study.toml").write_text("\n".join([*lines, line]))
-    text = run("sweep study.toml --quiet", status=2)
-    assert text.count("\n") == 1 and re.search(words, text), text
 
 
 MJCF = """<mujoco><worldbody>{}<body name="arm" pos="0 0 1"><joint name="j1" axis="0 1 0" pos="0 0 .1"/>
