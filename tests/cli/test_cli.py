@@ -544,6 +544,16 @@ def test_bad_input_is_one_line_and_exit_status_2(line, arm, folder, capsys):
     assert re.search(words, " ".join(shown.split()) if usage else shown)
 
 
+@pytest.mark.parametrize("name", ["forward_dynamics", "inverse_dynamics", "bias_force", "forward_kinematics"])
+def test_export_writes_the_function(name, arm, folder, run):
+    """Numbers in the test program are those of the library at the neutral configuration, without velocities and torques."""
+    assert f"in out: {name}.h, {name}.o, {name}_test.c" in run(f"export {arm} --function {name} --out out")
+    model, inputs = jd.load_model(arm), {"forward_dynamics": 3, "inverse_dynamics": 3, "bias_force": 2}.get(name, 1)
+    wanted = getattr(jd, name)(model, *[jnp.zeros(3)] * inputs)
+    numbers = re.search(r"expected_out\[\] = {(.*?)}", (folder / "out" / f"{name}_test.c").read_text())[1]
+    np.testing.assert_allclose([float.fromhex(x) for x in numbers.split(", ")], wanted.ravel(), rtol=1e-12, atol=1e-12)
+
+
 def test_debug_shows_where_an_error_arose():
     with pytest.raises(ValueError, match=r"nowhere\.urdf"):
         main(["info", "nowhere.urdf", "--debug"])
