@@ -23,12 +23,11 @@ from jaxdyn import (
 from jaxdyn.compile import compilation, jit
 from jaxdyn.constraints import Holonomic, Pfaffian, constraint_jacobian, loop, rolling_sphere, rolling_wheel
 from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.branches import degrees_of_freedom
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.constraints.frames import constraint_forces
-from jaxdyn.control.following import follow
-from jaxdyn.control.inverse_kinematics import inverse_kinematics
+from jaxdyn.constraints.selection import degrees_of_freedom
+from jaxdyn.control.inverse_kinematics import follow, inverse_kinematics
 from jaxdyn.dynamics.centroidal import center_of_mass, com_jacobian, kinetic_energy, potential_energy
 from jaxdyn.dynamics.frame_motion import frame_jacobian, frame_velocity
 from jaxdyn.dynamics.kinematics import body_jacobian, forward_kinematics, frame_pose

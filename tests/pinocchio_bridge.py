@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from xla_options import QUICK
 
 from jaxdyn.io import load_model
-from jaxdyn.model.joints import KINDS, SCREW_KINDS
+from jaxdyn.model.topology import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology
 
 ROBOTS = os.path.join(os.path.dirname(pin.__file__), "../../../../share/example-robot-data/robots")

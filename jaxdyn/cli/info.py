@@ -11,14 +11,13 @@ import numpy as np
 from jaxdyn.cli.common import FILE, add_model_options, load_scene, option, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.branches import count_free
-from jaxdyn.constraints.selection import independent_rows, select_rows
+from jaxdyn.constraints.selection import count_free, independent_rows, select_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.formats import format_of
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.configuration import columns_of, integrate
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model, inertia_report, repair_inertias
 
 HELP = "bodies, joints, limits, loops, frames and faulty inertias of a URDF, MJCF or SDF file"

@@ -15,24 +15,24 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import Evaluation, entry_point, evaluate, invalidate_derivatives, kernel
 from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
-from jaxdyn.constraints.branches import changes_branch, unit_rows
 from jaxdyn.constraints.closing import follow_path, nearest_configuration, polish
 from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import CLOSED, LEAST_GAP, check_tolerance, clear_pivot, tolerance
 from jaxdyn.constraints.redundancy import (
+    add_constraints,
+    changes_branch,
     coordinate_sizes,
     keep_rows,
     largest_ratio,
     opening_of_redundant,
     row_limits,
-    row_mask,
+    unit_size_rows,
 )
 from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, check_mapping, check_state, zeros_if_none
-from jaxdyn.model.numbers import as_static, check_count
+from jaxdyn.model.arguments import Numbers, as_static, check_count, check_mapping, check_state, zeros_if_none
 from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, displace, displacement
 
@@ -89,8 +89,8 @@ class Assembly(Outcome):
         """
         scene = as_scene(scene)
         held = {} if hold is None else {name: _first(value) for name, value in hold.items()}
-        whole = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in held.items())))
-        R, inverse = jax.vmap(lambda q: unit_rows(whole, q, t))(self.q)
+        whole = add_constraints(scene, [lock_joint(*joint) for joint in held.items()])
+        R, inverse = jax.vmap(lambda q: unit_size_rows(whole, q, t))(self.q)
         changes = jax.vmap(partial(changes_branch, scene.system))(self.q[:-1], self.q[1:], R[1:], R[:-1], inverse[:-1])
         return jnp.concatenate([jnp.zeros(1, bool), changes])
 
@@ -159,7 +159,7 @@ def assemble(
     hold = check_mapping(hold, "hold", '{"1": 0.5}')
     v = zeros_if_none(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in hold.items())))
+    locked = add_constraints(scene, [lock_joint(*joint) for joint in hold.items()])
     layout(locked)  # raises for joints that do not exist
     atol = None if atol is None else float(atol)
 
@@ -290,7 +290,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     kept = jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype)
     if selection is not None:
         locked, is_clear = _drop_rows(bare, selection, guess.dtype), jnp.asarray(selection.gap >= LEAST_GAP)
-        kept = row_mask(locked)
+        kept = locked.kept_rows.kept
     q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
         q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)

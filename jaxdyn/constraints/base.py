@@ -247,7 +247,16 @@ def position_residual(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) ->
 @kernel
 def _position_residual(scene: Scene, q, t):
     parts = [part for part in _positions(scene, q, t) if part is not None]
-    return jnp.concatenate(parts) if parts else jnp.zeros((0,), q.dtype)
+    return _drop(scene, jnp.concatenate(parts), holonomic_rows) if parts else jnp.zeros((0,), q.dtype)
+
+
+def _drop(scene: Scene, values, places: Callable | None = None):
+    """Values of the scene's rows, all or those at `places`, zero where a row is dropped (`Scene.kept_rows`)."""
+    if scene.kept_rows is None:
+        return values
+    kept = scene.kept_rows.kept if places is None else scene.kept_rows.kept[places(layout(scene))]
+    kept = kept.astype(values.dtype)
+    return values * (kept[:, None] if values.ndim > 1 else kept)
 
 
 def velocity_residual(
@@ -260,7 +269,7 @@ def velocity_residual(
 @kernel
 def _velocity_residual(scene: Scene, q, v, t):
     parts = _by_constraint(scene, q, v, t, lambda others: (_by_functions(others, q, v, t),))
-    return jnp.concatenate([part[-1] for part in parts])
+    return _drop(scene, jnp.concatenate([part[-1] for part in parts]))
 
 
 def _by_functions(scene: Scene, q, v, t):
@@ -288,7 +297,7 @@ def _rows(scene: Scene, q, v, t) -> Rows:
         return _by_differentiation(others, q, t), -rate, velocity
 
     parts = _by_constraint(scene, q, v, t, of_functions)
-    return Rows(*(jnp.concatenate(part) for part in zip(*parts, strict=True)))
+    return Rows(*(_drop(scene, jnp.concatenate(part)) for part in zip(*parts, strict=True)))
 
 
 def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nc nv"]:
@@ -318,7 +327,7 @@ def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) 
 def _jacobian(scene: Scene, q, t):
     at_rest = jnp.zeros((scene.nv,), q.dtype)
     parts = _by_constraint(scene, q, at_rest, t, lambda others: (_by_differentiation(others, q, t),))
-    return jnp.concatenate([part[0] for part in parts])
+    return _drop(scene, jnp.concatenate([part[0] for part in parts]))
 
 
 def _by_constraint(scene: Scene, q, v, t, of_functions: Callable) -> list[Any]:

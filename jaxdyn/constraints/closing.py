@@ -19,10 +19,9 @@ from jaxtyping import Array
 from jaxdyn.compile import implicit, invalidate_derivatives, kernel, pseudo_inverse_by_rotations, value_and_jvp
 from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.branches import passes_singular
 from jaxdyn.constraints.dynamics import correction, right_inverse, whiten_rows
 from jaxdyn.constraints.rank import CONVERGED, NEAR, NEGLIGIBLE, REGULAR, RESIDUAL, eps_of, solve_square
-from jaxdyn.constraints.redundancy import coordinate_sizes
+from jaxdyn.constraints.redundancy import coordinate_sizes, passes_singular
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.configuration import difference

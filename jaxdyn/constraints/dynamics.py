@@ -33,7 +33,7 @@ from jaxdyn.constraints.rank import (
     regular_gram,
     tolerance,
 )
-from jaxdyn.constraints.redundancy import distribute_multipliers, has_selection, row_mask
+from jaxdyn.constraints.redundancy import distribute_multipliers, has_selection
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
@@ -124,7 +124,10 @@ def constrained_dynamics(
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     places = layout(scene)
     if not places:
-        return _free_dynamics(scene, q, v, total_force(scene, q, v, tau, t), t)
+        metric = mass_factor(mass_matrix(scene.system, q, t))
+        a = metric.solve(total_force(scene, q, v, tau, t) - bias_force(scene.system, q, v, t))
+        result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)
+        return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), require_finite(result, a), ())
     state = q, v, tau, t
     scene = independent_rows(scene, q, t, rank_tol)
     if method != "rank_aware":
@@ -179,8 +182,11 @@ def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
         # Rows that leave no motion unless some repeat others: the fallback tells whether they do.
         is_poor = is_poor | ~(quality > least_pivot(q, rank_tol))
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
-    rank, result = _rank_and_result(scene, q, quality)
-    return a, lam, rank, require_finite(result, a)
+    # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a
+    # mass matrix that is not positive definite.
+    result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)
+    result = RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
+    return a, lam, _count_rows(scene), require_finite(result, a)
 
 
 def _gauss_problem(scene: Scene, q, v, tau, t):
@@ -190,18 +196,9 @@ def _gauss_problem(scene: Scene, q, v, tau, t):
     return metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma
 
 
-def _rank_and_result(scene: Scene, q, quality):
-    """Rank and code of rows that are treated as independent, from the ratio of their pivots."""
-    # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a
-    # mass matrix that is not positive definite.
-    rank = _count_rows(scene)
-    result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)
-    return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
-
-
 def _count_rows(scene: Scene) -> Array:
     """Number of rows that count, of independent ones."""
-    count = jnp.sum(row_mask(scene)) if has_selection(scene) else layout(scene)[-1].end
+    count = jnp.sum(scene.kept_rows.kept) if has_selection(scene) else layout(scene)[-1].end
     return jnp.asarray(count).astype(jnp.int32)
 
 
@@ -212,23 +209,20 @@ def total_force(scene: Scene, q, v, tau, t) -> Array:
     return tau if force is None else tau + force
 
 
-def _free_dynamics(scene, q, v, force, t) -> ConstrainedDynamics:
-    metric = mass_factor(mass_matrix(scene.system, q, t))
-    a = metric.solve(force - bias_force(scene.system, q, v, t))
-    result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)
-    return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), require_finite(result, a), ())
-
-
-def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:
+def solve_rows(scene: Scene, q, v, force, t, row: Rows) -> ConstrainedDynamics:
     """Acceleration and multipliers for rows A a = gamma with the scene's A; gamma may differ from the scene's."""
     bare = Scene(scene.system)
     metric, Y, free = kernel(_whiten_columns)(bare, q, v, force, t, row.A)
-    return _constrain_acceleration(scene, metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma, rank_tol)
+    return _constrain_acceleration(scene, metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma, None)
 
 
 def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, deficit, gamma, rank_tol) -> ConstrainedDynamics:
     """Dynamics by Gauss's principle: the least change of the free acceleration, in the metric M, that satisfies the rows."""
-    lam, w, inverse = _min_norm_solution(Y, deficit, rank_tol)
+    # The shortest w = Y lam with Y^T w = deficit, and lam of least norm. More rows than velocities are always dependent: the
+    # normal equations would fail for all samples, and are not tried.
+    inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), Y.shape[1] > Y.shape[0])
+    w = matmul(inverse.T, deficit)
+    lam = matmul(inverse, w)
     # For contradictory rows the pseudo-inverse silently returns a least-squares compromise, which leaves a residual. The residual
     # is compared with the terms that cancel in it, whose sizes are bounded by Cauchy-Schwarz: |Y_i . w| <= |Y_i| |w|.
     residual = jnp.abs(deficit - matmul(Y.T, w))
@@ -275,14 +269,6 @@ def _solve_with_refinement(factor, Y, right, quality, rank_tol):
     return x, is_poor & (is_open | ~(quality > least_refinable_pivot(right, rank_tol)))
 
 
-def _min_norm_solution(Y, deficit, rank_tol):
-    """lam of least norm, w = Y lam, which is the shortest w with Y^T w = deficit, and the pseudo-inverse of Y."""
-    # More rows than velocities are always dependent: the normal equations would fail for all samples, and are not tried.
-    inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), Y.shape[1] > Y.shape[0])
-    w = matmul(inverse.T, deficit)
-    return matmul(inverse, w), w, inverse
-
-
 def _by_schur(scene: Scene, q, v, tau, t) -> ConstrainedDynamics:
     """Dynamics with independent rows, by the Cholesky factor of A M^-1 A^T."""
     a, lam, independent, is_definite = kernel(_by_delassus)(scene, q, v, tau, t)
@@ -298,7 +284,7 @@ def _by_delassus(scene: Scene, q, v, tau, t):
     """Acceleration, multipliers, whether the rows are independent, and whether M is definite."""
     metric, Y, free, deficit, _ = _gauss_problem(scene, q, v, tau, t)
     factor = cholesky(regular_gram(Y) if has_selection(scene) else matmul(Y.T, Y))
-    # The same limit for pivots as in `_rank_and_result`. The factor's diagonal has their square roots.
+    # The same limit for pivots as in `_by_pivots`. The factor's diagonal has their square roots.
     roots = jnp.diagonal(factor)
     independent = jnp.min(roots) > (10 * scene.nv * eps_of(q)) ** 0.5 * jnp.max(roots)
     lam = solve_cholesky(factor, deficit)

@@ -20,10 +20,19 @@ from jaxtyping import Array, Float
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
-from jaxdyn.model.arguments import Checked, DType, Number, Numbers, check_body, check_flag, check_new_name, pose_leaf
-from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_difference
-from jaxdyn.model.numbers import as_float, as_number
-from jaxdyn.model.topology import body_index
+from jaxdyn.model.arguments import (
+    Checked,
+    DType,
+    Number,
+    Numbers,
+    as_float,
+    as_number,
+    check_body,
+    check_flag,
+    check_new_name,
+)
+from jaxdyn.model.host_math import pose_leaf
+from jaxdyn.model.topology import KINDS, SCREW_KINDS, body_index, joint_difference
 from jaxdyn.model.tree import Model
 
 

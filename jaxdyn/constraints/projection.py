@@ -22,7 +22,7 @@ from jaxdyn.constraints.rank import (
     regular_gram,
     tolerance,
 )
-from jaxdyn.constraints.redundancy import has_selection, row_mask, rows_of
+from jaxdyn.constraints.redundancy import has_selection, rows_of
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, solve_cholesky
@@ -111,7 +111,7 @@ def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
 
 def _by_rank_in_full(rank_tol, scene: Scene, q, v, t, errors):
     """`_by_rank` in the form of `_by_pivots`: it has done all rounds, so that none is left."""
-    are_poor = jnp.any(row_mask(scene) == 0) if has_selection(scene) else jnp.zeros((), bool)
+    are_poor = jnp.any(scene.kept_rows.kept == 0) if has_selection(scene) else jnp.zeros((), bool)
     return *_by_rank(rank_tol, scene, q, v, t, errors), are_poor, jnp.zeros((), bool)
 
 

@@ -19,7 +19,7 @@ from jaxdyn.compile import (
     variant,
 )
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.numbers import as_static
+from jaxdyn.model.arguments import as_static
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
 
 # Tolerances of constraints and of what is built on them, as powers of the rounding error eps of the dtype, with their values in

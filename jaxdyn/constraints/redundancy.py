@@ -1,4 +1,4 @@
-"""Scenes whose redundant rows are dropped: mask of rows, openings, multipliers; tolerances of residuals."""
+"""Scenes whose redundant rows are dropped: mask of rows, openings, multipliers; sizes of rows and residuals; branches."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import kernel
-from jaxdyn.compile.known import stop_gradient
+from jaxdyn.compile import eliminate_rows, kernel, pseudo_inverse_by_rotations
+from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.base import (
     Constraint,
     constraint_jacobian,
@@ -21,74 +21,28 @@ from jaxdyn.constraints.base import (
     rows,
     velocity_residual,
 )
-from jaxdyn.constraints.rank import REGULAR, eps_of, share
+from jaxdyn.constraints.rank import REGULAR, eps_of, share, tolerance
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, SystemLike
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displacement
 
 
-class KeptRows(Constraint):
-    """A constraint whose dropped rows are zero.
+class KeptRows(eqx.Module):
+    """The rows of a scene's constraints that count; the others are zero (`Scene.kept_rows`).
 
-    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`. `is_held`:
+    `kept` (nc,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`. `is_held`:
     whether the choice is the user's (`choose_rows`), which every function checks and renews.
     """
 
-    # Arrays, not static: another choice of rows in the course of a motion runs the same program. The three numbers belong to the
-    # scene; each constraint has them because a scene has no place of its own for them.
-    inner: Constraint
-    kept: Float[Array, " n"]
-    rounding: Float[Array, ""]
-    least: Float[Array, ""]
-    gap: Float[Array, ""]
-    name: str = eqx.field(static=True)
+    # Arrays, not static: another choice of rows in the course of a motion runs the same program.
+    kept: Float[Array | np.ndarray, " nc"]
+    rounding: Float[Array | np.ndarray, ""]
+    least: Float[Array | np.ndarray, ""]
+    gap: Float[Array | np.ndarray, ""]
     is_held: bool = eqx.field(static=True, default=False)
-
-    def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
-        """Residual of the inner constraint, zero in dropped rows."""
-        return self._mask_position(self.inner.position(system, q, t))
-
-    def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
-        """Residual of the inner constraint, zero in dropped rows."""
-        residual = self.inner.velocity(system, q, v, t)
-        # The nonholonomic rows of a constraint are its last ones, the holonomic rows its first ones.
-        return None if residual is None else residual * self.kept[-residual.shape[0] :].astype(q.dtype)
-
-    def sizes(self, system, dtype) -> tuple[int, int]:
-        """Numbers of rows of the inner constraint."""
-        return self.inner.sizes(system, dtype)
-
-    def wrench_components(self) -> tuple[int, ...] | None:
-        """Indices of the inner constraint."""
-        return self.inner.wrench_components()
-
-    def group(self):
-        """Key of the inner constraint's group, different from that of constraints with all rows."""
-        group = self.inner.group()
-        return None if group is None else ("kept rows", self.is_held, group)
-
-    def _mask_position(self, residual):
-        return None if residual is None else residual * self.kept[: residual.shape[0]].astype(residual.dtype)
-
-    @classmethod
-    def group_positions(cls, members: Sequence[Any], system, q, t) -> list:
-        """Residuals of the inner constraints, zero in dropped rows."""
-        inner = [member.inner for member in members]
-        residuals = inner[0].group_positions(inner, system, q, t)
-        return [member._mask_position(residual) for member, residual in zip(members, residuals, strict=True)]
-
-    @classmethod
-    def group_rows(cls, members: Sequence[Any], system, q, v, t) -> list:
-        """Rows of the inner constraints, zero where dropped."""
-        inner = [member.inner for member in members]
-        motions = []
-        for member, (A, gamma, velocity) in zip(members, inner[0].group_rows(inner, system, q, v, t), strict=True):
-            kept = member.kept.astype(q.dtype)
-            motions.append((kept[:, None] * A, kept * gamma, kept * velocity))
-        return motions
 
 
 class Selection(NamedTuple):
@@ -110,43 +64,73 @@ class Selection(NamedTuple):
 def keep_rows(scene: Scene, selection: Selection, *, is_held: bool = False) -> Scene:
     """The scene with the rows that are not kept set to zero."""
     kept, rounding, least, gap, _ = map(jnp.asarray, selection)
-    constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], rounding, least, gap, constraint.name, is_held)  # pyright: ignore[reportArgumentType]
-        for constraint, place in zip(scene.constraints, layout(scene), strict=True)
-    )
-    return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
+    return scene.with_kept_rows(KeptRows(kept, rounding, least, gap, is_held))
+
+
+def add_constraints(scene: Scene, more: Sequence[Constraint], forces: Sequence[Any] = ()) -> Scene:
+    """The system with the scene's constraints and, behind them, more, all of whose rows stay; with these forces alone."""
+    whole, rows = Scene(scene.system, (*scene.constraints, *more), forces), scene.kept_rows
+    if rows is None or not more:
+        return whole.with_kept_rows(rows)
+    # Known rows stay known within a trace.
+    xp = np if is_concrete(rows.kept) else jnp
+    stay = np.ones(layout(whole)[-1].end - rows.kept.size, rows.kept.dtype)
+    return whole.with_kept_rows(eqx.tree_at(lambda rows: rows.kept, rows, xp.concatenate([rows.kept, stay])))
 
 
 def has_selection(scene: Scene) -> bool:
     """True for a scene of `keep_rows`."""
-    return any(isinstance(constraint, KeptRows) for constraint in scene.constraints)
+    return scene.kept_rows is not None
 
 
 def holds_rows(scene: Scene) -> bool:
     """True for a scene of `choose_rows`."""
-    return any(isinstance(constraint, KeptRows) and constraint.is_held for constraint in scene.constraints)
+    return scene.kept_rows is not None and scene.kept_rows.is_held
 
 
 def exchange_rows(scene: Scene, rows: Float[Array, " n"]) -> Scene:
     """A scene of `keep_rows` with another choice of rows, in the form of `rows_of`."""
-    gap = scene.constraints[0].gap
-    return keep_rows(all_rows(scene), Selection(rows[:-1], scene.constraints[0].rounding, rows[-1], gap, gap))
+    old = scene.kept_rows
+    return scene.with_kept_rows(KeptRows(rows[:-1], old.rounding, rows[-1], old.gap))
 
 
 def all_rows(scene: Scene) -> Scene:
     """The scene with all of its rows, before `keep_rows`."""
-    constraints = tuple(c.inner if isinstance(c, KeptRows) else c for c in scene.constraints)
-    return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
-
-
-def row_mask(scene: Scene) -> Array:
-    """1 for rows that stay and 0 for dropped ones, (nc,), of a scene of `keep_rows`."""
-    return jnp.concatenate([c.kept for c in scene.constraints])
+    return scene.with_kept_rows(None)
 
 
 def rows_of(scene: Scene, dtype) -> Float[Array, " n"]:
     """The choice of rows as the vector that a step carries: 1 or 0 for each row, then `Selection.least`; a constant."""
-    return lax.stop_gradient(jnp.append(row_mask(scene), scene.constraints[0].least)).astype(dtype)
+    return lax.stop_gradient(jnp.append(scene.kept_rows.kept, scene.kept_rows.least)).astype(dtype)
+
+
+# A row below this part of the largest one of its constraint has no direction of its own: rounding is all that it holds.
+_TINY_ROW = 1e-3
+
+
+def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
+    """A for distances in units of the mechanism's length, each row scaled to length 1; rows of rounding alone stay small."""
+    # A row that vanishes at this configuration would become a unit row of noise, and count as independent.
+    sizes, _ = coordinate_sizes(scene.system, q.dtype)
+    A = constraint_jacobian(scene, q, t) * sizes[None]
+    squares = jnp.sum(A * A, 1)
+    largest = largest_of_each(scene, squares)
+    squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
+    # A constraint may have rows of zeros alone. By the reciprocal: products of known zeros are known, quotients are not.
+    return A * (1.0 / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny))))[:, None]
+
+
+def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
+    """Independent rows of B by Gram-Schmidt with pivots.
+
+    The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
+    others; a row is kept where its pivot is above `least`, and `most` rows at most.
+
+    **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of the others.
+    """
+    # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
+    kept, rest, pivots = eliminate_rows(B, first, least, min(B.shape) if most is None else most)
+    return kept, jnp.max(rest), jnp.min(jnp.where(kept > 0, pivots, jnp.inf))
 
 
 def largest_opening(scene: Scene, q, t, kept, v=None):
@@ -184,8 +168,8 @@ def residual_of_redundant(scene: Scene, q, v, t, a) -> Float[Array, ""]:
 
 def _constants(scene: Scene, q, t):
     """The scene with all of its rows and without forces, the mask of kept rows, q and t: without derivatives."""
-    whole = Scene(scene.system, all_rows(scene).constraints)
-    return stop_gradient((whole, row_mask(scene).astype(q.dtype), q, jnp.asarray(t, q.dtype)))
+    whole = Scene(scene.system, scene.constraints)
+    return stop_gradient((whole, scene.kept_rows.kept.astype(q.dtype), q, jnp.asarray(t, q.dtype)))
 
 
 def gap_of_redundant(scene: Scene, q, t) -> Float[Array, ""]:
@@ -203,7 +187,7 @@ def distribute_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Floa
     # Without this the loads of redundant bearings would depend on the choice of rows, and jump where it changes.
     if not has_selection(scene):
         return lam
-    kept, whole = row_mask(scene), all_rows(scene)
+    kept, whole = scene.kept_rows.kept, all_rows(scene)
     return _distribute(whole.without_forces, q, jnp.asarray(t, q.dtype), lam, kept)
 
 
@@ -228,7 +212,7 @@ def largest_of_each(scene: Scene, sizes) -> Array:
 def most_opening(scene: Scene, dtype):
     """Largest opening of dropped rows along a motion: a hundred times their opening or difference at its start, plus rounding."""
     # A hundred times, because the rounding of a file can cancel at the start: at the configuration in which it was written.
-    return 100 * scene.constraints[0].rounding + eps_of(jnp.zeros((), dtype)) ** REGULAR
+    return 100 * scene.kept_rows.rounding + eps_of(jnp.zeros((), dtype)) ** REGULAR
 
 
 # Tolerances of residuals, relative to the length of the mechanism.
@@ -307,3 +291,69 @@ def largest_ratio(relative: float, scene: Scene, q, v, t):
     residuals = position_residual(scene, q, t), velocity_residual(scene, q, v, t)
     ratios = jax.tree.map(lambda x, limit: jnp.abs(x) / limit, residuals, limits)
     return jnp.max(jnp.concatenate(ratios), initial=0.0)
+
+
+JUMP = 1.0  # rad or lengths of the mechanism: a longer way between two configurations is no small step
+
+
+def unit_size_rows(scene: Scene, q, t, factors=None):
+    """Rows of positions in coordinates scaled by their sizes, and their pseudo-inverse; constants.
+
+    `factors` (m,) are those of the last rows.
+    """
+    # Only decisions follow from these rows, so they are constants under differentiation.
+    scene, q = stop_gradient((scene, q))
+    sizes, _ = coordinate_sizes(scene.system, q.dtype)
+    R = constraint_jacobian(scene, q, t)[holonomic_rows(layout(scene))] * sizes[None]
+    if factors is not None:
+        count = R.shape[0] - factors.size
+        R = R * jnp.concatenate([jnp.ones((count,), q.dtype), lax.stop_gradient(factors)])[:, None]
+    return R, pseudo_inverse_by_rotations(R, tolerance(None, R))
+
+
+def changes_branch(system, before, after, R_after, R, inverse):
+    """Decide whether a combination of rows went through zero between two configurations, or a coordinate jumped.
+
+    `R` and `inverse` are those of `unit_size_rows` at the first one, `R_after` those at the second.
+    """
+    sizes, _ = coordinate_sizes(system, before.dtype)
+    jump = jnp.max(jnp.abs(displacement(system, before, after)) / sizes, initial=0.0)
+    return passes_singular(R, inverse, R_after) | (jump > JUMP)
+
+
+def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
+    """-1 where the determinant is negative, else 1; a constant."""
+    return kernel(_sign, fallback=_sign_by_lapack)(None, lax.stop_gradient(A))
+
+
+def passes_singular(
+    A: Float[Array, "m n"], inverse: Float[Array, "n m"], after: Float[Array, "m n"]
+) -> Bool[Array, ""]:
+    """Decide whether a combination of rows goes through zero between A, with its pseudo-inverse, and the rows `after`.
+
+    det(A' A^+ + (1 - A A^+)) then changes its sign. The second term fills the null space of dependent rows, where the
+    determinant of the first one is zero.
+    """
+    own = jnp.eye(A.shape[0], dtype=A.dtype) - matmul(A, inverse)
+    return sign_of_determinant(matmul(after, inverse) + own) < 0
+
+
+def _sign(_, A):
+    """Sign by Gaussian elimination with row exchanges until the largest entry of a column is its pivot."""
+    # Kernels have no index that depends on data: the exchanges are selections between neighbours, as in a bubble sort.
+    sign = jnp.ones((), A.dtype)
+    rows = list(A)
+    for k in range(len(rows)):
+        for i in range(k + 1, len(rows)):
+            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
+            rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
+            sign = jnp.where(swap, -sign, sign)
+        sign = jnp.where(rows[k][k] < 0, -sign, sign)
+        scale = 1 / jnp.where(rows[k][k] == 0, 1.0, rows[k][k])
+        for i in range(k + 1, len(rows)):
+            rows[i] = rows[i] - rows[i][k] * scale * rows[k]
+    return sign
+
+
+def _sign_by_lapack(_, A):
+    return jnp.where(jnp.linalg.slogdet(A)[0] < 0, -1.0, 1.0).astype(A.dtype)

@@ -26,13 +26,13 @@ from jaxdyn.model.arguments import (
     DType,
     Numbers,
     SystemLike,
+    as_number,
     check_body,
     check_flag,
     check_name,
     check_new_name,
-    pose_leaf,
 )
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.host_math import pose_leaf
 
 
 class TouchingPoint(NamedTuple):

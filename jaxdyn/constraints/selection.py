@@ -11,7 +11,7 @@ to a few digits are never dependent to rounding of the dtype. So rank is a prope
 The number of independent rows is decided once. Their choice is renewed before a step, where the kept rows have become nearly
 dependent (`renew_rows`).
 
-A dropped row stays in its place as a row of zeros (`KeptRows`), so that shapes, names and multipliers are those of the scene.
+A dropped row stays in its place as a row of zeros (`Scene.kept_rows`): shapes, names and multipliers are those of the scene.
 """
 
 from collections.abc import Callable
@@ -22,9 +22,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import Evaluation, eliminate_rows, entry_point, is_standalone, kernel, mark_invalid, variant
+from jaxdyn.compile import Evaluation, entry_point, is_standalone, kernel, mark_invalid, variant
 from jaxdyn.compile.batch import cond
 from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
@@ -33,9 +33,13 @@ from jaxdyn.constraints.rank import (
     LEAST_GAP,
     REGULAR,
     RESIDUAL,
+    check_tolerance,
     clear_pivot,
     eps_of,
+    has_clear_rank,
     least_pivot_of,
+    pseudo_inverse,
+    rank_of,
     solve_with_damping,
     tolerance,
 )
@@ -43,12 +47,13 @@ from jaxdyn.constraints.redundancy import (
     Selection,
     all_rows,
     coordinate_sizes,
+    eliminate,
     has_selection,
     holds_rows,
     keep_rows,
-    largest_of_each,
     largest_opening,
     rows_of,
+    unit_rows,
 )
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
@@ -67,33 +72,6 @@ UNCLEAR_RANK = (
     "the rank of the constraints is not clear at this q: singular values that count differ by less than a factor of "
     f"{LEAST_GAP:g} from those that do not"
 )
-# A row below this part of the largest one of its constraint has no direction of its own: rounding is all that it holds.
-_TINY_ROW = 1e-3
-
-
-def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
-    """A for distances in units of the mechanism's length, each row scaled to length 1; rows of rounding alone stay small."""
-    # A row that vanishes at this configuration would become a unit row of noise, and count as independent.
-    sizes, _ = coordinate_sizes(scene.system, q.dtype)
-    A = constraint_jacobian(scene, q, t) * sizes[None]
-    squares = jnp.sum(A * A, 1)
-    largest = largest_of_each(scene, squares)
-    squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
-    # A constraint may have rows of zeros alone. By the reciprocal: products of known zeros are known, quotients are not.
-    return A * (1.0 / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny))))[:, None]
-
-
-def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
-    """Independent rows of B by Gram-Schmidt with pivots.
-
-    The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
-    others; a row is kept where its pivot is above `least`, and `most` rows at most.
-
-    **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of the others.
-    """
-    # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
-    kept, rest, pivots = eliminate_rows(B, first, least, min(B.shape) if most is None else most)
-    return kept, jnp.max(rest), jnp.min(jnp.where(kept > 0, pivots, jnp.inf))
 
 
 def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene:
@@ -105,7 +83,7 @@ def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene
     values below the tolerance count as zero.
     """
     if holds_rows(scene):
-        return all_rows(scene) if rank_tol is not None else keep_rows(all_rows(scene), _held_selection(scene, q, t))
+        return all_rows(scene) if rank_tol is not None else keep_rows(scene, _held_selection(scene, q, t))
     if not (scene.rounding and scene.constraints) or rank_tol is not None or has_selection(scene):
         return scene
     selection = select_rows(scene, q, t)
@@ -124,15 +102,14 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
 
     **Arguments:** `scene`; `q` (nq,), on the constraints (`jd.assemble`), not in a singular position; `t`, s.
 
-    **Returns:** a scene for every function that takes one. Without redundant rows it is the one given.
+    **Returns:** a scene for every function that takes one; another `Scene` made of its parts has no choice. It is the one given
+    where no rows are redundant.
 
     **Raises:** ValueError where rounding hides which rows are independent.
 
     Source: docs/constraints.md, redundant rows.
     """
-    scene = as_scene(scene)
-    if has_selection(scene):
-        scene = all_rows(scene)
+    scene = all_rows(as_scene(scene))
     q, t = check_state(scene.system, q=q, t=t)
     selection = select_rows(scene, q, t)
     if is_concrete(selection):
@@ -148,7 +125,7 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
 
 def _held_selection(scene: Scene, q, t) -> Selection:
     """The choice that a scene of `choose_rows` holds, made again where it is poor."""
-    held, rows = scene.constraints[0], renew_rows(scene, q, t, False)
+    held, rows = scene.kept_rows, renew_rows(scene, q, t, False)
     gap = held.gap
     if scene.rounding:
         # In a singular position no choice is good, and rounding hides which rows are independent there.
@@ -166,7 +143,7 @@ def rank_code(scene: Scene, result: Any) -> Any:
     """The result, or `unclear_rank` where kept and dropped rows of a scene of `independent_rows` differ too little."""
     if not has_selection(scene):
         return result
-    is_clear = scene.constraints[0].gap >= LEAST_GAP
+    is_clear = scene.kept_rows.gap >= LEAST_GAP
     return RESULTS.where(is_clear, result, RESULTS.unclear_rank)
 
 
@@ -392,3 +369,53 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
 def most_rounding(dtype) -> float:
     """Opening of dropped rows above which they are not redundant but contradict the others."""
     return 10 * clear_pivot(np.zeros((), dtype))
+
+
+def degrees_of_freedom(
+    scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
+) -> int | Int[Array, ""]:
+    r"""Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
+
+    Dependent rows count once, so that the count is right for overconstrained linkages. It counts independent velocities at
+    this q: it is larger in singular positions, and rolling reduces it though all configurations remain reachable. Loops whose
+    rows are dependent only where the loops are closed need a q of `jd.assemble`. Distances are compared in
+    units of the mechanism's length, each row scaled to length 1; rows at rounding level count as zero.
+
+    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
+    largest count as zero, by default $\epsilon^{4/7}$, 1e-9 in float64.
+
+    **Returns:** an int for concrete arguments, an integer array () for traced ones, which is -1 where rounding of the numbers
+    hides the rank.
+
+    **Raises:** ValueError for shapes that do not fit, a `rank_tol` outside (0, 1), and for a rank that is not clear.
+
+    Source: EQUATIONS section 7; the rank is the trace of $A A^+$.
+
+    ```python
+    count = jd.degrees_of_freedom(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0])  # 1
+    ```
+    """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    rank_tol = check_tolerance(rank_tol)
+    if not layout(scene):
+        return scene.nv
+    free = count_free(independent_rows(scene, q, t, rank_tol), q, t, rank_tol)
+    if not is_concrete(free):
+        return free
+    if free < 0:
+        raise ValueError(f"{UNCLEAR_RANK}; give numbers with more digits, or a rank_tol between them")
+    return int(free)
+
+
+@entry_point
+def count_free(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
+    """`degrees_of_freedom` by rows that are taken as they are; -1 where the rank is not clear."""
+    # Scaled rows: the singular values of metres next to radians depend on the unit. The rank is by the
+    # pseudo-inverse that all other rank decisions use, so that they agree.
+    A = unit_rows(scene, q, t)
+    inverse = pseudo_inverse(A, tolerance(rank_tol, A), True)
+    is_clear = has_clear_rank(A, inverse, rank_tol)
+    if has_selection(scene):
+        is_clear = is_clear & (scene.kept_rows.gap >= LEAST_GAP)
+    return jnp.where(is_clear, scene.nv - rank_of(A, inverse), -1).astype(jnp.int32)

@@ -28,8 +28,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, check_flag
-from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.arguments import Numbers, as_float, as_number, check_flag
 
 # Components (fx, fy, fz, tx, ty, tz) of a wrench that each contact transmits.
 _SPATIAL = {
@@ -179,7 +178,11 @@ class FrictionCone(eqx.Module):
         second = self.second_order_rows()
         if second.shape[0]:
             first, *rest = jnp.unstack(matmul(second[0].astype(force.dtype), force))
-            cone_margins.append((first - _length(rest, smoothing))[None])
+            square = jnp.sum(jnp.stack(rest) ** 2)
+            if not _is_zero(smoothing):
+                square = square + jnp.asarray(smoothing, square.dtype) ** 2
+            # The derivative of the root is zero where it vanishes.
+            cone_margins.append((first - safe_sqrt(square))[None])
         return jnp.concatenate([*cone_margins, -matmul(self.linear_rows().astype(force.dtype), force)])
 
     def margin(self, force: Numbers, smoothing: Numbers = 0.0) -> Float[Array, ""]:
@@ -206,14 +209,6 @@ class FrictionCone(eqx.Module):
 
 def _is_zero(smoothing) -> bool:
     return is_concrete(smoothing) and np.ndim(smoothing) == 0 and float(smoothing) == 0
-
-
-def _length(parts, smoothing):
-    """Smoothed norm sqrt(sum of squares + smoothing^2), with zero derivative where it vanishes."""
-    square = jnp.sum(jnp.stack(parts) ** 2)
-    if not _is_zero(smoothing):
-        square = square + jnp.asarray(smoothing, square.dtype) ** 2
-    return safe_sqrt(square)
 
 
 def friction_cone(

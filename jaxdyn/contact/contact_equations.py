@@ -55,8 +55,7 @@ from jaxdyn.contact.surfaces import (
 )
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import Numbers
-from jaxdyn.model.numbers import as_float
+from jaxdyn.model.arguments import Numbers, as_float
 
 
 class ContactKinematics(eqx.Module):

@@ -1,7 +1,8 @@
 r"""Impulses of contacts with Coulomb's friction: the cone complementarity problem with de Saxce's correction.
 
 Contacts have impulses x in Lorentz cones K (half-lines for contacts without friction) and velocities y = W x + q, with W positive
-semidefinite, both in coordinates (normal, tangential) in which the friction coefficient is one (`scaled_rows`). Coulomb's law is
+semidefinite, both in coordinates (normal, tangential) in which the friction coefficient is one
+(`contact_problem.scaled`). Coulomb's law is
 
     K contains x, orthogonal to s = (y0 + |y1|, y1) in K,
 

@@ -19,8 +19,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.contact.cones import SIDES, Cones, FrictionCone, surface_cone
 from jaxdyn.contact.qp import QPSolution, solve_qp
-from jaxdyn.model.arguments import Checked, Numbers, as_array, batch_hint, state_dtype
-from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.arguments import Checked, Numbers, as_array, as_float, as_number, batch_hint, state_dtype
 from jaxdyn.systems.scene import Scene
 
 

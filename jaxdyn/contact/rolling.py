@@ -28,16 +28,8 @@ from jaxdyn.constraints.rolling import Touching, TouchingPoint, check_has_rows, 
 from jaxdyn.contact.contact_equations import Patch, Steps, newton_steps, patch_at
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import (
-    Checked,
-    Number,
-    Numbers,
-    as_array,
-    check_body,
-    check_new_name,
-    check_shapes,
-    pose_leaf,
-)
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_body, check_new_name, check_shapes
+from jaxdyn.model.host_math import pose_leaf
 from jaxdyn.model.tree import Model
 
 
@@ -408,17 +400,16 @@ def _search_places(system: RollingModel, joints, near):
     coordinates = []
     for i, contact in enumerate(system.contacts):
         R, p = rotations[i], positions[i]
-        start = _between(contact, R, p) if near is None else _place_of_coordinates(contact, near[i])
+        if near is None:
+            start = _between(contact, R, p)
+        else:
+            start = jnp.concatenate([contact.shape_a.place_of(near[i][:2]), contact.shape_b.place_of(near[i][2:4])])
 
         def improve(_, place, contact=contact, R=R, p=p):
             return contact.with_place(place).track(R, p, 1)
 
         coordinates.append(lax.fori_loop(0, _STEPS_SEARCHED, improve, start))
     return jnp.concatenate([joints, *coordinates])
-
-
-def _place_of_coordinates(contact: RollingContact, alpha):
-    return jnp.concatenate([contact.shape_a.place_of(alpha[:2]), contact.shape_b.place_of(alpha[2:4])])
 
 
 def _between(contact: RollingContact, R, p):

@@ -32,8 +32,8 @@ from jaxdyn.contact.shapes import Ball, Box, Capsule, ConvexHull, Feature, Lowes
 from jaxdyn.contact.surfaces import Plane, Sphere, Surface
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, check_body, pose_leaf
-from jaxdyn.model.numbers import as_float, check_count
+from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, as_float, check_body, check_count
+from jaxdyn.model.host_math import pose_leaf
 from jaxdyn.systems.scene import as_pytree
 
 

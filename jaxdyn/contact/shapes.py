@@ -18,8 +18,7 @@ from jaxdyn.compile.known import as_numpy_if_known, is_concrete
 from jaxdyn.constraints.rolling import unit_or
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid, Sphere
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers
-from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.arguments import Numbers, as_float, as_number
 
 # Below this sine of its tilt, the lowest point of a cylinder moves from the rim to the axis, and inwards by this share of it.
 UPRIGHT, RECESS = 1e-3, 0.1
@@ -36,7 +35,9 @@ class Box(eqx.Module):
     size: Float[Array, "3"]
 
     def __init__(self, size: Numbers):
-        self.size = _lengths(size, "Box: size")
+        self.size = as_float(size, "Box: size", (3,))
+        if is_concrete(self.size) and not bool(jnp.all((self.size > 0) & jnp.isfinite(self.size))):
+            raise ValueError(f"Box: size is {np.asarray(self.size).tolist()}; give three positive lengths (m)")
 
 
 class Capsule(eqx.Module):
@@ -225,13 +226,6 @@ def _ends(length) -> list:
 
 def _leaf(value, like: Array) -> Array:
     return as_float(value, "shape", like=like.dtype)
-
-
-def _lengths(value: Numbers, what: str) -> Float[Array, "3"]:
-    lengths = as_float(value, what, (3,))
-    if is_concrete(lengths) and not bool(jnp.all((lengths > 0) & jnp.isfinite(lengths))):
-        raise ValueError(f"{what} is {np.asarray(lengths).tolist()}; give three positive lengths (m)")
-    return lengths
 
 
 _DIRECTIONS = 400  # in which the error of a hull is measured

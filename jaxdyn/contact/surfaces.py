@@ -25,8 +25,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, check_flag
-from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.arguments import Checked, Function, Numbers, as_float, as_number, check_flag
 from jaxdyn.systems.scene import as_pytree
 
 

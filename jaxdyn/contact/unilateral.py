@@ -21,12 +21,12 @@ from jaxdyn.model.arguments import (
     Numbers,
     SystemLike,
     as_array,
+    as_number,
     check_body,
     check_name,
     check_new_name,
-    pose_leaf,
 )
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.host_math import pose_leaf
 from jaxdyn.systems.scene import Scene, as_pytree
 
 
@@ -119,7 +119,11 @@ class DryFriction(WithModes):
             self.along = _Coordinate(index=along, name=name)
         else:
             self.along = along if isinstance(along, Constraint) else Pfaffian(along, name=name)
-        self.smoothing = _positive(smoothing, f"DryFriction {name!r}: smoothing")
+        what = f"DryFriction {name!r}: smoothing"
+        self.smoothing = None if smoothing is None else jnp.asarray(as_array(smoothing, what), float)
+        # A velocity, m/s.
+        if is_concrete(self.smoothing) and self.smoothing is not None and not (np.asarray(self.smoothing) > 0).all():
+            raise ValueError(f"{what} is {smoothing}; give a positive velocity (m/s), or None for friction that sticks")
 
 
 class UnilateralContact(WithModes):
@@ -295,13 +299,3 @@ def _coefficients(sliding: Any, static: Any, owner: str):
         if not (np.isfinite(mu).all() and (mu >= 0).all() and np.isfinite(mu_s).all() and (mu_s >= mu).all()):
             raise ValueError(f"{owner}: friction is {mu} and static {mu_s}; give 0 <= friction <= static")
     return coefficients
-
-
-def _positive(value: Any, what: str):
-    """Check a positive velocity (m/s) and convert it to a leaf; None stays None."""
-    if value is None:
-        return None
-    number = jnp.asarray(as_array(value, what), float)
-    if is_concrete(number) and not (np.asarray(number) > 0).all():
-        raise ValueError(f"{what} is {value}; give a positive velocity (m/s), or None for friction that sticks")
-    return number

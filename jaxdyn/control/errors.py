@@ -27,8 +27,7 @@ from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, as_array, as_shape, batch_hint, is_concrete
-from jaxdyn.model.numbers import as_float
+from jaxdyn.model.arguments import Number, Numbers, as_array, as_float, as_shape, batch_hint, is_concrete
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller

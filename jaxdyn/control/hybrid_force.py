@@ -40,8 +40,7 @@ from jaxdyn.control.errors import (
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, check_state
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, as_number, check_state
 from jaxdyn.reduction.inverse_dynamics import velocity_choice
 from jaxdyn.reduction.minimal import gauge_invariant
 from jaxdyn.systems.scene import Scene, as_pytree

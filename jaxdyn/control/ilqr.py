@@ -26,10 +26,20 @@ from jaxdyn.compile import batch
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import eps_of
-from jaxdyn.control.box_qp import minimize_in_box
+from jaxdyn.contact.qp import minimize_in_box
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_hint, check_flag
-from jaxdyn.model.numbers import as_float, as_number, as_static, check_count
+from jaxdyn.model.arguments import (
+    Checked,
+    Function,
+    Numbers,
+    as_array,
+    as_float,
+    as_number,
+    as_static,
+    batch_hint,
+    check_count,
+    check_flag,
+)
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import as_pytree
 

@@ -11,21 +11,40 @@ from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxdyn.compile import entry_point, invalidate_derivatives
-from jaxdyn.compile.known import is_concrete, is_known, stop_gradient
+from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.assembly import check_search, closing_tolerance, independent_rows_near
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
-from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant, own_length
-from jaxdyn.constraints.selection import most_rounding
-from jaxdyn.control.targets import Aims, as_targets, clip_to_limits, screw_joints, search, target_rows
-from jaxdyn.model.arguments import Checked, Given, Number, Numbers, as_operand, check_flag, check_mapping, check_state
+from jaxdyn.constraints.rank import condition_number, rank_of
+from jaxdyn.constraints.redundancy import (
+    KeptRows,
+    add_constraints,
+    changes_branch,
+    has_selection,
+    opening_of_redundant,
+    unit_size_rows,
+)
+from jaxdyn.constraints.selection import independent_rows, most_rounding
+from jaxdyn.control.targets import (
+    TASKS,
+    Aims,
+    aims_of,
+    as_targets,
+    clip_to_limits,
+    reaches_targets,
+    row_weights,
+    screw_joints,
+    search,
+)
+from jaxdyn.model.arguments import Checked, Number, Numbers, check_flag, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace
@@ -130,7 +149,7 @@ def inverse_kinematics(
     factors = row_weights(rows, weights, guess.dtype)
     # Forces and cones do not affect configurations: they are left out, so that others do not cause a second compilation.
     place = _solve(
-        Scene(model, scene.constraints),
+        scene.without_forces,
         rows,
         guess,
         factors,
@@ -152,37 +171,14 @@ def inverse_kinematics(
     return require_success(place, throw, message)
 
 
-def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Given:
-    """Weights (m,) of all rows of the targets."""
-    weights = check_mapping(weights, "weights", f"{{{rows[0].name!r}: 2.0}}")
-    names = {row.name.partition(" ")[0] if row.name not in weights else row.name for row in rows}
-    unknown = set(weights) - {row.name for row in rows} - {getattr(row, "frame", row.name) for row in rows}
-    if unknown:
-        raise ValueError(f"weights names {sorted(unknown)}, which are no targets; targets are {sorted(names)}")
-    parts = []
-    for row in rows:
-        count = sum(target_rows(row))
-        value = weights.get(row.name, weights.get(getattr(row, "frame", row.name), 1.0))
-        value = as_operand(value, f"weights[{row.name!r}]", dtype)
-        if value.shape not in ((), (count,)):
-            raise ValueError(
-                f"weights[{row.name!r}] has shape {value.shape}; give one number, or {(count,)}, one per row of the target"
-            )
-        if is_concrete(value) and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
-            raise ValueError(f"weights[{row.name!r}] is {np.asarray(value)}; give numbers that are not negative")
-        parts.append((value, count))
-    join: Any = np if is_known([value for value, _ in parts]) else jnp
-    return join.concatenate([join.broadcast_to(value, (count,)) for value, count in parts])
-
-
 @entry_point
 def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
     model, every = scene.system, scene
     scene = independent_rows_near(scene, guess, t)
-    whole = Scene(model, (*scene.constraints, *rows))
+    whole = add_constraints(scene, rows)
     # The search is not differentiated: `_differentiable` attaches the derivatives of its result.
     fixed, start, factors, time = stop_gradient((whole, guess, factors, t))
-    aims = _aims(fixed, len(scene.constraints), factors, limits, atol)
+    aims = aims_of(fixed, len(scene.constraints), factors, limits, atol)
 
     if steps > 1:  # equal parts of what the guess leaves open
         first = position_residual(fixed, clip_to_limits(model, start, aims), time)
@@ -196,10 +192,13 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
         start = lax.scan(go_on, start, parts)[0]
     q, tried = search(fixed, start, time, aims, guesses)
     q = lax.stop_gradient(q)
-    is_reached = _reaches_targets(fixed, q, time, aims)
+    is_reached = reaches_targets(fixed, q, time, aims)
     if len(scene.constraints):
-        # Out of reach, the last steps trade errors of targets for small openings, which are closed after.
-        q = jnp.where(is_reached, q, lax.stop_gradient(search(fixed, q, time, _exact_rows_only(aims), 1)[0]))
+        # Out of reach, the last steps trade errors of targets for small openings, which are closed after: any errors of the
+        # targets satisfy these aims.
+        tolerances = jnp.where(aims.is_exact > 0, aims.tolerances, jnp.full_like(aims.tolerances, jnp.inf))
+        closing = aims._replace(weights=aims.weights * aims.is_exact, tolerances=tolerances)
+        q = jnp.where(is_reached, q, lax.stop_gradient(search(fixed, q, time, closing, 1)[0]))
     # The implicit function theorem holds at a solution only. Elsewhere q is a constant, and its derivatives are NaN.
     solution, is_nearest = _differentiable(whole, q, posture, t, aims, len(scene.constraints))
     q = jnp.where(is_reached & is_nearest, solution, q)
@@ -214,44 +213,12 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     if has_selection(scene):
         opening = jnp.maximum(opening, jnp.max(jnp.abs(position_residual(every, q, t))))
     # Evaluated again, because sliding towards the posture has changed q.
-    reached = _reaches_targets(fixed, lax.stop_gradient(q), time, aims)
+    reached = reaches_targets(fixed, lax.stop_gradient(q), time, aims)
     reached = reached & (opening_of_redundant(scene, q, t) <= most_rounding(q.dtype))
     closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)
     result = RESULTS.where(reached, RESULTS.where(is_nearest, RESULTS.successful, RESULTS.not_nearest), result)
     return InverseKinematics(q, jnp.max(counted, initial=0.0), errors, opening, result, tried)
-
-
-def _reaches_targets(scene: Scene, q, t, aims: Aims):
-    r = aims.weights * position_residual(scene, q, t)
-    return jnp.all(jnp.abs(r) <= aims.tolerances)
-
-
-def _aims(whole: Scene, constraints: int, factors, limits: bool, atol) -> Aims:
-    """Weights and tolerances of all rows; rows of targets in m count in units of the mechanism's length."""
-    model, dtype = whole.system, factors.dtype
-    length = lax.stop_gradient(own_length(model)).astype(dtype)
-    targets = whole.constraints[constraints:]
-    nh = holonomic_rows(layout(whole)).size
-    is_length = np.concatenate([np.repeat([True, False], target_rows(target)) for target in targets])
-    # In units of the mechanism's length, errors in m are comparable with those in rad.
-    scale = jnp.where(is_length, 1 / length, jnp.ones_like(length))
-    count = nh - is_length.size
-    weights = jnp.concatenate([jnp.ones((count,), dtype), factors * scale])
-    near = closing_tolerance(dtype) if atol is None else atol
-    least = near * (jnp.maximum(length, 1.0) if atol is None else jnp.ones_like(length))
-    # Tolerances have the weights of their rows: a weight of zero gives a row and a tolerance of zero, which counts as reached.
-    tolerances = jnp.concatenate([jnp.broadcast_to(least, (count,)), least * factors * scale])
-    exact = jnp.asarray(np.arange(nh) < count, dtype)
-    endless = jnp.full_like(model.lower, jnp.inf)
-    lower, upper = (model.lower, model.upper) if limits else (-endless, endless)
-    return Aims(weights, jnp.zeros((nh,), dtype), tolerances, exact, *stop_gradient((lower, upper)))
-
-
-def _exact_rows_only(aims: Aims) -> Aims:
-    """Aims that any errors of the targets satisfy."""
-    tolerances = jnp.where(aims.is_exact > 0, aims.tolerances, jnp.full_like(aims.tolerances, jnp.inf))
-    return aims._replace(weights=aims.weights * aims.is_exact, tolerances=tolerances)
 
 
 def _with_derivatives(scene: Scene, guess, place, is_nearest, t: Number):
@@ -266,25 +233,26 @@ def _with_derivatives(scene: Scene, guess, place, is_nearest, t: Number):
 def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints: int):
     """q as the configuration nearest to itself, or to a posture, that reaches the targets, with its derivatives."""
     model: Model = whole.system
-    is_counted, first = aims.tolerances > 0, int(aims.is_exact.size)
-    rows = list(whole.constraints)
-    for i in reversed(range(constraints, len(rows))):
-        first -= sum(target_rows(rows[i]))
-        # Rows of weight zero are masked: q does not satisfy them, so that they have no derivative there.
-        counted = is_counted[first : first + sum(target_rows(rows[i]))].astype(q.dtype)
-        none = jnp.zeros((), q.dtype)
-        rows[i] = KeptRows(rows[i], counted, none, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
-    joints = _joints_with_limits(model, aims)
-    at = np.asarray(joints, int)
+    first = layout(whole)[constraints].start
+    own = jnp.ones((first,), q.dtype) if whole.kept_rows is None else whole.kept_rows.kept[:first]
+    # Rows of weight zero are masked: q does not satisfy them, so that they have no derivative there.
+    counted = (aims.tolerances > 0)[holonomic_rows(layout(whole)) >= first].astype(q.dtype)
+    none = jnp.zeros((), q.dtype)
+    whole = whole.with_kept_rows(KeptRows(jnp.concatenate([own, counted]), none, none, none))
+    # Places in q of the joints of one degree of freedom that have limits, or may have some.
+    at, _ = screw_joints(model)
+    if is_concrete(aims.lower, aims.upper):
+        at = at[np.isfinite(np.asarray(aims.lower)[at]) | np.isfinite(np.asarray(aims.upper)[at])]
+    joints = tuple(at.tolist())
     lower, upper = aims.lower[at], aims.upper[at]
 
     def scene_at(active) -> Scene:
         """With the joints that are `active` held at their lower (-1) or upper (1) limits."""
         if not joints:
-            return Scene(model, tuple(rows))
+            return whole
         limit = jnp.where(active < 0, lower, upper)
         at_limit = jnp.where(active != 0, limit, jnp.zeros_like(limit))
-        return Scene(model, (*rows, _HeldAtLimits(active, at_limit, joints)))
+        return add_constraints(whole, [_HeldAtLimits(active, at_limit, joints)])
 
     def sides(below, above):
         return above.astype(q.dtype) - below.astype(q.dtype)
@@ -296,7 +264,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         place, _ = _with_derivatives(scene, q, q, jnp.ones((), q.dtype), t)
         return place, jnp.asarray(True)
 
-    fixed, guess, time = stop_gradient((Scene(model, tuple(rows)), posture, t))
+    fixed, guess, time = stop_gradient((whole, posture, t))
     bounds = None
     if joints:
         at_v = np.asarray([slot for place, slot in zip(*screw_joints(model), strict=True) if place in joints])
@@ -309,23 +277,143 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
     place, is_nearest = _with_derivatives(scene, posture, found, end.is_nearest, t)
     if not joints:
         return place, is_nearest > 0
-    place = clip_rounding(place, at, lower, upper)
+    # A joint that is held at a limit satisfies its row up to this tolerance only: those that pass it by rounding are put on it.
+    near = closing_tolerance(q.dtype)
+    x = place[at]
+    x = jnp.where((x < lower) & (x > lower - near), lower, x)
+    place = place.at[at].set(jnp.where((x > upper) & (x < upper + near), upper, x))
     is_within = jnp.all((place[at] >= lower) & (place[at] <= upper))
     return place, (is_nearest > 0) & is_within
 
 
-def clip_rounding(q, at: np.ndarray, lower, upper):
-    """q with joints that pass a limit by rounding on it."""
-    # A joint that is held at a limit satisfies its row up to this tolerance only.
-    near = closing_tolerance(q.dtype)
-    x = q[at]
-    x = jnp.where((x < lower) & (x > lower - near), lower, x)
-    return q.at[at].set(jnp.where((x > upper) & (x < upper + near), upper, x))
+# --- along a path: each configuration from the one before, with a test that the branch was kept ---
+#
+# The rows R of constraints and targets, weighted and in coordinates scaled by the sizes of joints, have singular values that
+# count the distance from a singular position. Where a combination of rows goes through zero between two configurations, the
+# determinant of R' R^+ + (1 - R R^+) changes its sign: the branch is another one after that.
 
 
-def _joints_with_limits(model: Model, aims: Aims) -> tuple[int, ...]:
-    """Places in q of the joints of one degree of freedom that have limits, or may have some."""
-    at_q, _ = screw_joints(model)
-    if is_concrete(aims.lower, aims.upper):
-        at_q = at_q[np.isfinite(np.asarray(aims.lower)[at_q]) | np.isfinite(np.asarray(aims.upper)[at_q])]
-    return tuple(at_q.tolist())
+class Following(Outcome):
+    """Configurations along a path of targets.
+
+    - `q` (n, nq); `residual` (n,) and `result` (n,) as of `InverseKinematics`.
+    - `regularity` (n,): r / (|R| |R^+|) of the rows of constraints and targets, of rank r: 1 where all singular values are equal,
+      at most r times the least over the largest one, and 0 where the rank is less than at the first place.
+    - `changes_branch` (n,): whether between the configuration before and this one a combination of rows went through zero, or
+      a coordinate jumped by more than a radian or a length of the mechanism.
+    """
+
+    q: Float[Array, "n nq"]
+    residual: Float[Array, " n"]
+    result: Any
+    regularity: Float[Array, " n"]
+    changes_branch: Bool[Array, " n"]
+
+
+def follow(
+    scene: SceneLike,
+    targets: Checked[Mapping[str, Any]],
+    guess: Float[Array, " nq"],
+    *,
+    guesses: int = 1,
+    t: Numbers = 0.0,
+    throw: bool | None = None,
+    **options: Any,
+) -> Following:
+    """Inverse kinematics along a path or over a grid: each configuration by `inverse_kinematics` from the one before.
+
+    The first one is searched for from the guess, all others by the least change, which keeps the branch where the path has steps
+    short enough; `changes_branch` says where that was lost.
+
+    **Arguments:** as of `inverse_kinematics`, and
+
+    - `targets`: as there, with one row for each of the n places: poses (n, 4, 4), or dictionaries of positions (n, 3) and
+      directions (n, 3). A grid is followed row by row, forth and back.
+    - `guesses`: number of starts at the places after the first one; the first is searched for from 16.
+    - `options`: further ones of `inverse_kinematics`.
+
+    **Returns:** `Following`. Derivatives are those of each configuration by its own targets.
+
+    **Raises:** ValueError as `inverse_kinematics`, and for targets of different lengths; if `throw`, by default if all inputs are
+    concrete, for a place that was not reached, with its index.
+
+    Source: Allgower & Georg (1990), Numerical continuation methods, chapters 2 and 5.
+
+    ```python
+    arm = jd.robots.iiwa()
+    start = jd.frame_pose(arm, jnp.full(7, 0.5), "iiwa_link_7")
+    path = jnp.stack([start.at[2, 3].add(-0.01 * k) for k in range(5)])
+    q = jd.follow(arm, {"iiwa_link_7": path}, jnp.full(7, 0.5)).q
+    ```
+    """
+    scene = as_scene(scene)
+    (guess,) = check_state(scene.system, q=guess)
+    if not isinstance(targets, Mapping) or not targets:
+        raise ValueError(f"targets is {targets!r}; give a dictionary of targets by the names of frames")
+    # A target that is an array stands under an empty name.
+    rows = {name: dict(value) if isinstance(value, Mapping) else {"": value} for name, value in targets.items()}
+    # An axis is one vector for the whole path: it must not be scanned over like the rows of the targets.
+    axes = {name: value.pop("axis") for name, value in rows.items() if "axis" in value}
+    for name, value in rows.items():
+        if not value:
+            raise ValueError(
+                f"targets[{name!r}] is {targets[name]}, which names no target; give some of {', '.join(TASKS)}"
+            )
+    lengths = {name: np.shape(x)[0] if np.ndim(x) else 0 for name, value in rows.items() for x in value.values()}
+    if len(set(lengths.values())) != 1 or 0 in lengths.values():
+        raise ValueError(f"targets have the lengths {lengths}; give every target one row for each place of the path")
+
+    def at(row):
+        """Targets of one place, as `inverse_kinematics` takes them."""
+        named = {name: value | {"axis": axes[name]} if name in axes else value for name, value in row.items()}
+        return {name: value[""] if "" in value else value for name, value in named.items()}
+
+    rows = jax.tree.map(jnp.asarray, rows)
+    first, rest = (jax.tree.map(lambda x, part=part: x[part], rows) for part in (0, slice(1, None)))
+    factors = row_weights(as_targets(scene.system, at(first)), options.get("weights"), guess.dtype)
+
+    def place(row, guess, guesses):
+        """A configuration, and its rows."""
+        # A scan cannot raise: places that were not reached are reported after it, by their index.
+        reached = inverse_kinematics(scene, at(row), guess, guesses=guesses, t=t, throw=False, **options)
+        counted = independent_rows(scene, lax.stop_gradient(reached.q), t)
+        whole = add_constraints(counted, as_targets(scene.system, at(row)))
+        return reached, unit_size_rows(whole, lax.stop_gradient(reached.q), t, factors)
+
+    def go_on(carry, row):
+        q, R, inverse = carry
+        reached, (R_after, inverse_after) = place(row, q, guesses)
+        # Derivatives are those of each place by its own targets: the chain through the places before it is cut.
+        after = lax.stop_gradient(reached.q)
+        changes = changes_branch(scene.system, q, after, R_after, R, inverse)
+        regularity = _regularity(R_after, inverse_after, rank)
+        return (after, R_after, inverse_after), (reached, regularity, changes)
+
+    # 16 guesses, the default of `inverse_kinematics`: only the first place has no neighbour to start from.
+    begin, (R, inverse) = place(first, guess, 16)
+    # The rank at the first place is the reference for all others.
+    rank = rank_of(R, inverse)
+    states = (lax.stop_gradient(begin.q), R, inverse)
+    _, (places, regularity, changes) = lax.scan(go_on, states, rest)
+    every = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), begin, places)
+    regularity = jnp.concatenate([_regularity(R, inverse, rank)[None], regularity])
+    changes = jnp.concatenate([jnp.zeros(1, bool), changes])
+    path = Following(every.q, every.residual, every.result, regularity, changes)
+
+    def message(path: Following) -> str:
+        lost = np.flatnonzero(~np.asarray(path.success))
+        return (
+            f"follow: {lost.size} places of {path.q.shape[0]} were not reached, the first one number {lost[0]}, with errors "
+            f"up to {float(path.residual[lost[0]]):.3g} (m or rad); give shorter steps, more guesses, or throw=False"
+        )
+
+    return require_success(path, throw, message)
+
+
+def _regularity(R, inverse, rank):
+    """r / (|R| |R^+|) in Frobenius' norm, and 0 where the rank r is less than `rank`."""
+    size = condition_number(R, inverse)
+    # By the inequality of Cauchy and Schwarz |R| |R^+| >= r. The minimum removes rounding above 1.
+    regular = jnp.minimum(rank / jnp.where(size > 0, size, jnp.ones_like(size)), 1.0)
+    # R^+ omits singular values below the tolerance: a drop of rank does not make |R^+| large and needs a test of its own.
+    return jnp.where(rank_of(R, inverse) >= rank, regular, jnp.zeros_like(regular))

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.constraints.loops import Loop, loop, pose_leaf
+from jaxdyn.constraints.loops import Loop, loop
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.cones import FrictionCone, wrench_basis
 from jaxdyn.contact.forces import cone_bounds
@@ -25,9 +25,8 @@ from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.dynamics.quantities import inverse_dynamics
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Numbers, as_array, check_shapes, is_concrete
-from jaxdyn.model.host_math import ORTHONORMAL_GROUND, rotation_fault
-from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.arguments import Checked, Numbers, as_array, as_float, as_number, check_shapes, is_concrete
+from jaxdyn.model.host_math import ORTHONORMAL_GROUND, pose_leaf, rotation_fault
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.reduction.inverse_dynamics import velocity_choice

@@ -30,8 +30,8 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import gravity_force, inverse_dynamics
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, pose_leaf, state_dtype
-from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_float, as_number, state_dtype
+from jaxdyn.model.host_math import pose_leaf
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene

@@ -25,22 +25,27 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile.known import is_concrete, is_known
+from jaxdyn.compile.known import is_concrete, is_known, stop_gradient
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.constraints.assembly import closing_tolerance
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.rank import eps_of
-from jaxdyn.constraints.redundancy import coordinate_sizes
+from jaxdyn.constraints.redundancy import coordinate_sizes, own_length
 from jaxdyn.constraints.rolling import tangents
 from jaxdyn.control.errors import CenterError, Fixed
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import as_operand, batch_hint
+from jaxdyn.model.arguments import (
+    as_operand,
+    batch_hint,
+    check_mapping,
+)
 from jaxdyn.model.host_math import ORTHONORMAL_TARGET, rotation_fault
-from jaxdyn.model.joints import SCREW_KINDS
-from jaxdyn.model.topology import frame_index
+from jaxdyn.model.topology import SCREW_KINDS, frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
@@ -129,6 +134,29 @@ def target_rows(target: Constraint) -> tuple[int, int]:
     return _ROWS[target.task] if isinstance(target, FrameTarget) else (3, 0)
 
 
+def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array | np.ndarray:
+    """Weights (m,) of all rows of the targets."""
+    weights = check_mapping(weights, "weights", f"{{{rows[0].name!r}: 2.0}}")
+    names = {row.name.partition(" ")[0] if row.name not in weights else row.name for row in rows}
+    unknown = set(weights) - {row.name for row in rows} - {getattr(row, "frame", row.name) for row in rows}
+    if unknown:
+        raise ValueError(f"weights names {sorted(unknown)}, which are no targets; targets are {sorted(names)}")
+    parts = []
+    for row in rows:
+        count = sum(target_rows(row))
+        value = weights.get(row.name, weights.get(getattr(row, "frame", row.name), 1.0))
+        value = as_operand(value, f"weights[{row.name!r}]", dtype)
+        if value.shape not in ((), (count,)):
+            raise ValueError(
+                f"weights[{row.name!r}] has shape {value.shape}; give one number, or {(count,)}, one per row of the target"
+            )
+        if is_concrete(value) and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
+            raise ValueError(f"weights[{row.name!r}] is {np.asarray(value)}; give numbers that are not negative")
+        parts.append((value, count))
+    join: Any = np if is_known([value for value, _ in parts]) else jnp
+    return join.concatenate([join.broadcast_to(value, (count,)) for value, count in parts])
+
+
 def _task_of(name: str, value) -> str:
     shape = np.shape(value)
     kinds = {(4, 4): "pose", (3, 3): "orientation", (3,): "position"}
@@ -212,6 +240,32 @@ class Aims(NamedTuple):
     upper: Array
 
 
+def reaches_targets(scene: Scene, q, t, aims: Aims):
+    r = aims.weights * position_residual(scene, q, t)
+    return jnp.all(jnp.abs(r) <= aims.tolerances)
+
+
+def aims_of(whole: Scene, constraints: int, factors, limits: bool, atol) -> Aims:
+    """Weights and tolerances of all rows; rows of targets in m count in units of the mechanism's length."""
+    model, dtype = whole.system, factors.dtype
+    length = lax.stop_gradient(own_length(model)).astype(dtype)
+    targets = whole.constraints[constraints:]
+    nh = holonomic_rows(layout(whole)).size
+    is_length = np.concatenate([np.repeat([True, False], target_rows(target)) for target in targets])
+    # In units of the mechanism's length, errors in m are comparable with those in rad.
+    scale = jnp.where(is_length, 1 / length, jnp.ones_like(length))
+    count = nh - is_length.size
+    weights = jnp.concatenate([jnp.ones((count,), dtype), factors * scale])
+    near = closing_tolerance(dtype) if atol is None else atol
+    least = near * (jnp.maximum(length, 1.0) if atol is None else jnp.ones_like(length))
+    # Tolerances have the weights of their rows: a weight of zero gives a row and a tolerance of zero, which counts as reached.
+    tolerances = jnp.concatenate([jnp.broadcast_to(least, (count,)), least * factors * scale])
+    exact = jnp.asarray(np.arange(nh) < count, dtype)
+    endless = jnp.full_like(model.lower, jnp.inf)
+    lower, upper = (model.lower, model.upper) if limits else (-endless, endless)
+    return Aims(weights, jnp.zeros((nh,), dtype), tolerances, exact, *stop_gradient((lower, upper)))
+
+
 class SearchState(NamedTuple):
     """State of a search.
 
@@ -245,11 +299,6 @@ def search(scene: Scene, q, t, aims: Aims, guesses: int) -> tuple[Array, Array]:
 
 
 def _step(guesses: int, scene: Scene, constants, state: SearchState, _) -> Iteration:
-    after = _improve(guesses, scene, constants, state)
-    return Iteration(after, ~state.done, ~after.done)
-
-
-def _improve(guesses: int, scene: Scene, constants, state: SearchState) -> SearchState:
     t, aims = constants
     q, damping = state.q, state.damping
     r = residual(scene, q, t, aims)
@@ -276,7 +325,8 @@ def _improve(guesses: int, scene: Scene, constants, state: SearchState) -> Searc
     tried_next = state.tried + elsewhere.astype(jnp.int32)
     other = _place(scene.system, state.guess, tried_next, aims)
     other = jnp.where(tried_next >= guesses, best, other)
-    return SearchState(
+    done = reached | (stops & is_last)
+    after = SearchState(
         jnp.where(elsewhere, other, q),
         jnp.where(elsewhere, jnp.full_like(damping, _DAMPING), damping),
         jnp.where(elsewhere, jnp.zeros_like(state.steps), state.steps + 1),
@@ -284,8 +334,9 @@ def _improve(guesses: int, scene: Scene, constants, state: SearchState) -> Searc
         best,
         least,
         state.guess,
-        reached | (stops & is_last),
+        done,
     )
+    return Iteration(after, ~state.done, ~done)
 
 
 def residual(scene: Scene, q, t, aims: Aims):
@@ -309,8 +360,11 @@ def _levenberg_marquardt_step(scene: Scene, q, t, aims: Aims, r, damping):
 
     step = shortest(R)
     # Once only: where the new step would pass other limits, the caller clips it, and the next step leaves those joints out.
-    inside = _is_inside(scene.system, q, step, aims)
-    if inside is not None:
+    at_q, at_v = screw_joints(scene.system)
+    if at_q.size:
+        low = (q[at_q] <= aims.lower[at_q]) & (step[at_v] < 0)
+        high = (q[at_q] >= aims.upper[at_q]) & (step[at_v] > 0)
+        inside = jnp.ones_like(step).at[at_v].set(1 - (low | high).astype(q.dtype))
         step = shortest(R * inside[None]) * inside
     # Shortened as a whole, so that its direction remains.
     length = jnp.max(jnp.abs(step))
@@ -327,16 +381,6 @@ def screw_joints(model: Model) -> tuple[np.ndarray, np.ndarray]:
     ]
     places = np.asarray(pairs, int).reshape(-1, 2)
     return places[:, 0], places[:, 1]
-
-
-def _is_inside(model: Model, q, step, aims: Aims):
-    """1 for coordinates that may move along a step (nv,), 0 for those that it would take out of their limits; None: all may."""
-    at_q, at_v = screw_joints(model)
-    if not at_q.size:
-        return None
-    low = (q[at_q] <= aims.lower[at_q]) & (step[at_v] < 0)
-    high = (q[at_q] >= aims.upper[at_q]) & (step[at_v] > 0)
-    return jnp.ones_like(step).at[at_v].set(1 - (low | high).astype(q.dtype))
 
 
 def clip_to_limits(model: Model, q, aims: Aims):

@@ -47,8 +47,7 @@ from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import velocity_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Number, Numbers, as_shape, warn
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_number, as_shape, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene
 from jaxdyn.systems.system import displacement
@@ -146,7 +145,10 @@ class GraspForce(ForceIntegral):
     ) -> Float[Array, " nc"]:
         """Internal part of the force error, (nc,)."""
         # Only the internal part is integrated: the other part balances the motion of the object and has no reference.
-        return self._internal(q, t, multipliers - as_preload(self.scene, self.preload(t), q.dtype))
+        error = multipliers - as_preload(self.scene, self.preload(t), q.dtype)
+        G = constraint_jacobian(self.scene, q, t)[:, velocity_rows(self.scene)[1]].T
+        # With zero wrench `split_forces` is the projection on the internal forces.
+        return split_forces(G, jnp.zeros((G.shape[0],), q.dtype), error)
 
     def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Commanded acceleration (nv,), consistent with the contacts and the object's error equation."""
@@ -184,11 +186,6 @@ class GraspForce(ForceIntegral):
             # The integral acts on forces, whose sign is that of lam: no torque of the object's motion changes.
             preload = preload - times(self.ki, state, "ki")
         return split_forces(G, push[velocity_rows(self.scene)[1]], preload)
-
-    def _internal(self, q, t, forces):
-        G = constraint_jacobian(self.scene, q, t)[:, velocity_rows(self.scene)[1]].T
-        # With zero wrench `split_forces` is the projection on the internal forces.
-        return split_forces(G, jnp.zeros((G.shape[0],), q.dtype), forces)
 
 
 # Whole-body control of legged robots: centre of mass, attitude of the base and posture.

@@ -17,9 +17,8 @@ from jaxdyn.dynamics.tree_frames import take, tree_frame
 from jaxdyn.dynamics.world_frame import joint_wrenches
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.arguments import as_static, check_shapes
 from jaxdyn.model.configuration import configuration_rate
-from jaxdyn.model.numbers import as_static
 from jaxdyn.model.topology import joint_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor, solve_positive
@@ -254,7 +253,12 @@ def _workspace(model: Model, q, v, frame: str, axes: str, rows: tuple[int, ...],
     factor = mass_factor(mass_matrix(model, q))
     # J M^-1 J^T as a Gram matrix stays symmetric and semidefinite in rounding.
     whitened = factor.whiten(J.T)
-    scale, scaled = _unit_diagonal(matmul(whitened.T, whitened))
+    gram = matmul(whitened.T, whitened)
+    diagonal = jnp.diagonal(gram)
+    # Scaled to a unit diagonal, but for rows of zeros. The root of a safe number: 1/sqrt(0) in an unselected branch would make
+    # the gradient NaN.
+    scale = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, jnp.ones_like(diagonal)))
+    scaled = scale[:, None] * gram * scale[None]
     condition = gram_eigenvectors(whitened * scale[None])[0][-1]
     # Damping starts at the threshold and grows linearly, so that Lambda is continuous in q; its slope jumps there.
     damping = jnp.maximum(least - condition, jnp.zeros_like(condition))
@@ -275,14 +279,6 @@ def _workspace(model: Model, q, v, frame: str, axes: str, rows: tuple[int, ...],
         condition=condition,
         damped=damping > 0,
     )
-
-
-def _unit_diagonal(matrix):
-    """Scale a matrix to D matrix D with a unit diagonal; rows of zeros keep the factor 1 in D (m,)."""
-    diagonal = jnp.diagonal(matrix)
-    # The root of a safe number: 1/sqrt(0) in an unselected branch would make the gradient NaN.
-    scale = 1.0 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, jnp.ones_like(diagonal)))
-    return scale, scale[:, None] * matrix * scale[None]
 
 
 # Wrenches through the joints of a tree in motion, and its articulated bodies, which give them as functions of accelerations.

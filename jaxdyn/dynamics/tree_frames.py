@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import sweep, variant
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
+from jaxdyn.model.topology import KINDS, SCREW_KINDS, joint_transform, screw_transform
 from jaxdyn.model.tree import Model, Topology, geometry
 
 # Numbers of bodies from which on a quantity is computed by loops in native code, whose size does not grow with the bodies.

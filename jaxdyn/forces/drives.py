@@ -16,11 +16,20 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices, scatter
 from jaxdyn.forces.piecewise import PiecewiseForce
-from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, check_name, check_names, is_concrete
+from jaxdyn.model.arguments import (
+    Checked,
+    Function,
+    Number,
+    Numbers,
+    SystemLike,
+    as_float,
+    check_name,
+    check_names,
+    is_concrete,
+)
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
-from jaxdyn.model.joints import KINDS
-from jaxdyn.model.numbers import as_float
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import DriveDynamics, Scene, as_pytree
 

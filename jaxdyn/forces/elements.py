@@ -16,9 +16,17 @@ from jaxtyping import Array, Float
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, named_frame
 from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.lie import se3
-from jaxdyn.model.arguments import Number, Numbers, SystemLike, batch_hint, check_names, check_state, is_concrete
+from jaxdyn.model.arguments import (
+    Number,
+    Numbers,
+    SystemLike,
+    as_float,
+    batch_hint,
+    check_names,
+    check_state,
+    is_concrete,
+)
 from jaxdyn.model.configuration import difference, neutral
-from jaxdyn.model.numbers import as_float
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene

@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.forces.elements import as_names, broadcast_leaf, joint_indices
-from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete
-from jaxdyn.model.joints import KINDS
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, as_number, is_concrete
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, pass_command
 

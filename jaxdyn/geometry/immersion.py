@@ -24,8 +24,7 @@ from jaxdyn.compile.known import is_known
 from jaxdyn.dynamics import centroidal
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, check_flag, check_state
-from jaxdyn.model.numbers import as_float, check_count
+from jaxdyn.model.arguments import Checked, Function, Numbers, as_float, check_count, check_flag, check_state
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
 from jaxdyn.systems.system import SceneLike, System, describe_state, rate_to_velocity
 
@@ -203,7 +202,7 @@ class PulledForce(eqx.Module):
             return total
         # Evaluated once, because an interaction depends on all units.
         common_forces = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
-        return _add_forces(total, common_forces, "force")
+        return _add_forces(total, common_forces)
 
     def __call__(self, system, s, v, t):
         if not isinstance(system, ImmersedSystem):
@@ -315,7 +314,7 @@ def reaction_force(
     applied = [jnp.zeros_like(w) for w in speeds]
     if force is not None:
         given = force if immersed.joined and isinstance(force, Sequence) else (force,)
-        applied = _add_forces(applied, [as_float(part, "force", (None,), q.dtype) for part in given], "force")
+        applied = _add_forces(applied, [as_float(part, "force", (None,), q.dtype) for part in given])
     for pulled in scene.forces:
         applied = [a + f for a, f in zip(applied, pulled.on_units(immersed, places, speeds, t), strict=True)]
     tau = _sum(matmul(m.J.T, f) for m, f in zip(motions, applied, strict=True))
@@ -326,11 +325,11 @@ def reaction_force(
     return reactions if immersed.joined else reactions[0]
 
 
-def _add_forces(total, forces, argument: str) -> list[Array]:
+def _add_forces(total, forces) -> list[Array]:
     """Add the forces that a user gave, one for each unit, to the total of each unit."""
     if len(forces) != len(total):
-        raise ValueError(f"{argument} has {len(forces)} entries; give one for each of the {len(total)} systems")
-    return [f + check_force(g, f, f.shape[0], argument) for f, g in zip(total, forces, strict=True)]
+        raise ValueError(f"force has {len(forces)} entries; give one for each of the {len(total)} systems")
+    return [f + check_force(g, f, f.shape[0], "force") for f, g in zip(total, forces, strict=True)]
 
 
 def _sum(terms):

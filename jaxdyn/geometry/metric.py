@@ -22,8 +22,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.quantities import first_kind_symbols, mass_matrix
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, check_system, state_dtype
-from jaxdyn.model.numbers import as_float
+from jaxdyn.model.arguments import Numbers, as_array, as_float, batch_hint, check_state, check_system, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene

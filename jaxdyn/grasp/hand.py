@@ -19,16 +19,8 @@ from jaxdyn.contact.cones import Cones, components
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import (
-    Checked,
-    DType,
-    Numbers,
-    SystemLike,
-    as_shape,
-    check_body,
-    check_new_name,
-    pose_leaf,
-)
+from jaxdyn.model.arguments import Checked, DType, Numbers, SystemLike, as_shape, check_body, check_new_name
+from jaxdyn.model.host_math import pose_leaf
 from jaxdyn.model.joining import join_all
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene

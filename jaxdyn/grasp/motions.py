@@ -27,8 +27,7 @@ from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, check_state
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.arguments import Number, Numbers, as_number, check_state
 from jaxdyn.reduction.bases import Basis, Parametrization, least_quality, orthonormal, split_directions
 from jaxdyn.systems.mass_factor import solve_lower
 from jaxdyn.systems.scene import Scene

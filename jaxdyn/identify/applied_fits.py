@@ -354,7 +354,8 @@ def _with_friction(scene: Scene, motors: np.ndarray, terms, v_s: float, sizes) -
     friction = Friction(viscous, coulomb, jnp.asarray(zero, dtype), jnp.asarray(v_s, dtype))
     others = [force for force in scene.forces if not isinstance(force, (JointDamping, CoulombFriction))]
     rotors = armature if model.armature is not None or "armature" in terms else None
-    return Scene(model.replace(armature=rotors), scene.constraints, [friction, *others])
+    moved = Scene(model.replace(armature=rotors), scene.constraints, [friction, *others])
+    return moved.with_kept_rows(scene.kept_rows)
 
 
 def _numbers(scene: Scene, motors: np.ndarray, terms) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.branches import degrees_of_freedom
+from jaxdyn.constraints.selection import degrees_of_freedom
 from jaxdyn.dynamics.quantities import bias_force, inverse_dynamics
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.mechanisms import check_motors, follow_motors, motor_basis

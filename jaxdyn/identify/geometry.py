@@ -30,8 +30,7 @@ from jaxdyn.identify.geometry_errors import (
     solve_loops,
 )
 from jaxdyn.lie import se3, so3
-from jaxdyn.model.arguments import Checked, Numbers, as_array
-from jaxdyn.model.numbers import check_count, check_seed
+from jaxdyn.model.arguments import Checked, Numbers, as_array, check_count, check_seed
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import SceneLike

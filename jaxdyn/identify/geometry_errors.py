@@ -32,8 +32,7 @@ from jaxdyn.identify.blocks import perpendicular_basis
 from jaxdyn.lie import se3, so3
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import as_array
-from jaxdyn.model.joints import SCREW_KINDS
-from jaxdyn.model.topology import frame_index
+from jaxdyn.model.topology import SCREW_KINDS, frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.model.arguments import Checked, Numbers, is_concrete
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 
 # Columns that jump are evaluated on this many times the samples of a log before they are low-passed.

@@ -13,14 +13,12 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.constraints.assembly import Assembly, assemble
 from jaxdyn.constraints.base import layout, position_residual, rows, velocity_residual
-from jaxdyn.constraints.branches import degrees_of_freedom
 from jaxdyn.constraints.codes import CODES, RESULTS, code_of
-from jaxdyn.constraints.selection import independent_rows
+from jaxdyn.constraints.selection import degrees_of_freedom, independent_rows
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.torque_terms import friction_regressor
-from jaxdyn.model.arguments import Function, Numbers, as_array, deprecated, state_dtype
-from jaxdyn.model.numbers import as_float
+from jaxdyn.model.arguments import Function, Numbers, as_array, as_float, deprecated, state_dtype
 from jaxdyn.model.topology import velocity_indices
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive

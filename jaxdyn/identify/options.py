@@ -43,8 +43,16 @@ from jaxdyn.identify.result import (
     simulation_options,
 )
 from jaxdyn.identify.torque_terms import friction_of
-from jaxdyn.model.arguments import Checked, FilePath, SystemLike, check_mapping, warn
-from jaxdyn.model.numbers import as_static, check_count, check_seed
+from jaxdyn.model.arguments import (
+    Checked,
+    FilePath,
+    SystemLike,
+    as_static,
+    check_count,
+    check_mapping,
+    check_seed,
+    warn,
+)
 from jaxdyn.simulation.controls import Control
 from jaxdyn.systems.system import displace
 from jaxdyn.tasks import DaskClient

@@ -19,10 +19,9 @@ import numpy as np
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
-from jaxdyn.model.arguments import Number, Numbers, as_array, check_shapes, is_concrete
+from jaxdyn.model.arguments import Number, Numbers, as_array, check_seed, check_shapes, is_concrete
 from jaxdyn.model.configuration import integrate, neutral
-from jaxdyn.model.joints import KINDS
-from jaxdyn.model.numbers import check_seed
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 
 

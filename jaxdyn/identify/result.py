@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.codes import Outcome, name_of
+from jaxdyn.constraints.redundancy import add_constraints
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log, as_logs, check_log
 from jaxdyn.identify.mechanisms import FitSystem, Measured, build_scene, motor_basis, on_constraints
@@ -167,7 +168,7 @@ def scene_and_segments(
     scene = as_scene(system)
     log = as_logs(log, scene.system, needs=("v",))
     if friction is not None:
-        scene = Scene(scene.system, scene.constraints, (*scene.forces, friction))
+        scene = add_constraints(scene, (), (*scene.forces, friction))
     return scene, segments(log, horizon, state_dtype(scene.system), restart=isinstance(system, Model))
 
 

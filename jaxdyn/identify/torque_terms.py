@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.identify.logs import Log, filter_like_log, refine_samples, samples_for_jumps
-from jaxdyn.model.arguments import Number, SystemLike, warn
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.arguments import Number, SystemLike, as_number, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 

@@ -14,7 +14,7 @@ from jaxdyn.dynamics.kinematics import body_jacobian
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, warn
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.topology import SCREW_KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.sensors import Sensor
 from jaxdyn.systems.scene import DriveDynamics, Force, Scene, as_pytree

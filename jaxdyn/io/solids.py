@@ -17,8 +17,8 @@ from jaxdyn.io.loaded import Names, NotTaken
 from jaxdyn.io.sdf_file import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
+from jaxdyn.model.arguments import check_count
 from jaxdyn.model.builder import unknown
-from jaxdyn.model.numbers import check_count
 from jaxdyn.model.tree import Model
 
 _FOLDERS = ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH")

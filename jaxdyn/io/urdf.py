@@ -17,7 +17,7 @@ from jaxdyn.io.xml_lines import XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers
 from jaxdyn.model.builder import ModelBuilder, unknown
-from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
+from jaxdyn.model.topology import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model, inertia_problems
 
 # URDF has no number for "no limit", and other readers refuse "inf"; `save_urdf` writes the largest double.

@@ -27,8 +27,7 @@ from jaxdyn.io.urdf_parts import Mimic
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import as_path
-from jaxdyn.model.joints import KINDS
-from jaxdyn.model.topology import frame_index, joint_index
+from jaxdyn.model.topology import KINDS, frame_index, joint_index
 from jaxdyn.model.tree import Model
 
 _SUFFIXES = (".yaml", ".yml")

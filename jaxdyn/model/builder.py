@@ -16,7 +16,7 @@ import numpy as np
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Number, Numbers, check_name, store_leaf
-from jaxdyn.model.joints import KINDS, SCREW_KINDS
+from jaxdyn.model.topology import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology, check_rounding, warn_unphysical_inertias
 
 GRAVITY = (0.0, 0.0, -9.81)

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import array_namespace
-from jaxdyn.model.arguments import Numbers, check_shapes
-from jaxdyn.model.joints import (
+from jaxdyn.model.arguments import Numbers, as_float, check_shapes
+from jaxdyn.model.topology import (
     KINDS,
     joint_difference,
     joint_integrate,
@@ -17,7 +17,6 @@ from jaxdyn.model.joints import (
     joint_random,
     joint_rate,
 )
-from jaxdyn.model.numbers import as_float
 from jaxdyn.model.tree import Model, Topology
 
 

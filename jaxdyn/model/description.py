@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import state_dtype
-from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.topology import SCREW_KINDS
 
 
 def tree_table(model) -> str:
@@ -43,14 +43,10 @@ def scene_lines(scene) -> str:
         f"constraint {getattr(one, 'name', '')!r} ({type(one).__name__}): {_rows(one, scene.system)}"
         for one in scene.constraints
     ]
-    lines += [f"force {_force_name(one)}" for one in scene.forces]
-    return "\n".join(lines)
-
-
-def _force_name(force) -> str:
     # A static wrapper shows the name of the function that it holds.
-    function = getattr(force, "function", None)
-    return getattr(function, "__name__", type(force).__name__)
+    named = [(getattr(force, "function", None), type(force).__name__) for force in scene.forces]
+    lines += [f"force {getattr(function, '__name__', kind)}" for function, kind in named]
+    return "\n".join(lines)
 
 
 def _rows(constraint, system) -> str:
@@ -79,21 +75,16 @@ def solution_lines(solution) -> str:
                           "torque", "control_state")
              if getattr(solution, name) is not None]  # fmt: skip
     more = [*given, *(f"pose:{name}" for name in solution.poses)]
+    dropped, redundant = "", int(solution.stats.get("redundant_rows", 0))
+    if redundant:
+        rows, gap = f"row{'s' * (redundant > 1)}", short(float(solution.stats["redundant_gap"]))
+        dropped = f"\n  dropped {redundant} redundant {rows} of the constraints, open by up to {gap} (m or rad)"
     return (
         f"Solution: {words}, t = {short(float(t[0]))} to {short(float(solution.stats['time_reached']))} s of "
         f"{short(float(t[-1]))} s\n  {solution.solver}: {steps} steps, {rejected} rejected\n"
         f"  {t.shape[0]} rows of q ({solution.q.shape[1]}), v ({solution.v.shape[1]})"
-        f"{', ' if more else ''}{', '.join(more)}{_redundant(solution)}"
+        f"{', ' if more else ''}{', '.join(more)}{dropped}"
     )
-
-
-def _redundant(solution) -> str:
-    """Rows of the constraints that repeat what others say, if there are any."""
-    count = int(solution.stats.get("redundant_rows", 0))
-    if not count:
-        return ""
-    gap = short(float(solution.stats["redundant_gap"]))
-    return f"\n  dropped {count} redundant row{'s' * (count > 1)} of the constraints, open by up to {gap} (m or rad)"
 
 
 def _is_readable(leaf, ndim: int) -> bool:

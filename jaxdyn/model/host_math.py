@@ -10,9 +10,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import array_namespace, is_concrete
-from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
+from jaxdyn.model.arguments import store_leaf
+from jaxdyn.model.topology import KINDS, SCREW_KINDS, joint_neutral
 
 # Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
 SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
@@ -123,6 +125,16 @@ def pose_matrix(pose, what: str) -> Values:
     return given
 
 
+def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
+    """Convert a pose to an array leaf; its numbers may be traced, and jax arrays (4, 4) are used unchanged."""
+    if isinstance(pose, jax.Array) and pose.shape == (4, 4):
+        return pose
+    # A position keeps its own dtype; the route through `pose_matrix` would give it the default one.
+    if isinstance(pose, jax.Array) and pose.shape == (3,):
+        return store_leaf(pose_of(np.eye(3), pose), pose.dtype)
+    return store_leaf(pose_matrix(pose, what), float)
+
+
 def rotation_fault(rotation: Values, tolerance: float) -> str:
     """Description of the fault of a known matrix (3, 3) that is no rotation; empty for a rotation."""
     # Measured before the determinant: a matrix that is far from orthonormal may have any determinant.
@@ -169,7 +181,7 @@ def rotation_from_z(axis: np.ndarray) -> np.ndarray:
 
 
 def joint_pose(kind: str, screw: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Pose of `joints.joint_transform` in float64: that of the body frame relative to its home pose."""
+    """Pose of `topology.joint_transform` in float64: that of the body frame relative to its home pose."""
     pose = np.eye(4)
     if kind in SCREW_KINDS:
         v, axis = screw[:3], screw[3:]

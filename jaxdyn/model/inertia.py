@@ -15,9 +15,8 @@ from jaxdyn.compile import kernel
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import so3
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import Checked, Number, Numbers, Row
+from jaxdyn.model.arguments import Checked, Number, Numbers, Row, as_static
 from jaxdyn.model.host_math import SYMMETRIC, TRIANGLE
-from jaxdyn.model.numbers import as_static
 
 
 def _check_shapes(**given) -> None:

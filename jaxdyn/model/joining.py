@@ -10,8 +10,9 @@ import numpy as np
 
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Numbers, check_new_name, pose_leaf, store_leaf
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.arguments import Checked, Numbers, check_new_name, store_leaf
+from jaxdyn.model.host_math import pose_leaf
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model, Topology
 
 

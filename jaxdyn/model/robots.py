@@ -10,7 +10,7 @@ from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Number, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.inertia import box, cylinder, displaced, nearest_feasible, sphere
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 
 _QUARTER = np.pi / 2

@@ -19,8 +19,7 @@ from jaxdyn.contact.rolling import RollingContact
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid
 from jaxdyn.grasp.hand import Contact, Grasp
 from jaxdyn.model import host_math
-from jaxdyn.model.joints import joint_neutral
-from jaxdyn.model.topology import frame_index
+from jaxdyn.model.topology import frame_index, joint_neutral
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene

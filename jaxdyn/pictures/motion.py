@@ -16,7 +16,7 @@ from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.grasp.hand import Contact
 from jaxdyn.model.arguments import as_array
-from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.topology import SCREW_KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures.default_solids import frame_poses
 from jaxdyn.simulation.solution import Solution

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
-from jaxdyn.constraints.branches import sign_of_determinant
 from jaxdyn.constraints.rank import REGULAR, RESIDUAL, condition_number, eps_of, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.redundancy import sign_of_determinant
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, as_shape, check_state

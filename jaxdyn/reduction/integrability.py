@@ -101,19 +101,14 @@ def involutive(
         if len(ranks) > 1 and (ranks[-1] == ranks[-2] or ranks[-1] >= most):
             return Involutivity(ranks[-1] == ranks[0], tuple(ranks), tuple(evidence))
         # With constant rank, the fields that are independent at q span the level around it.
-        kept = _independent(spanned, new, limit * sizes[0])
+        # Directions in the span already are removed once; pivoting, the largest first, then needs only the new columns.
+        rest = new - spanned @ np.linalg.lstsq(spanned, new, rcond=None)[0] if spanned.shape[1] else new
+        columns, pivots = pivot_rows(rest.T)
+        kept = columns[pivots > limit * sizes[0]].tolist()
         spanned = np.concatenate([spanned, new[:, kept]], 1)
         pairs = [(i, k) for k in kept for i in range(count + 1) if levels or i > k]  # [X_k, X_i] = -[X_i, X_k]
         levels = (*levels, tuple(pairs))
         new = np.asarray(_fields(scene, reference, q, t, levels), float)
-
-
-def _independent(spanned, new, limit) -> list[int]:
-    """Select columns of `new` that add a direction to those of `spanned`, the largest first."""
-    # Directions in the span already are removed once; pivoting then needs only the new columns.
-    rest = new - spanned @ np.linalg.lstsq(spanned, new, rcond=None)[0] if spanned.shape[1] else new
-    columns, pivots = pivot_rows(rest.T)
-    return columns[pivots > limit].tolist()
 
 
 @eqx.filter_jit

@@ -126,9 +126,12 @@ def constrained_inverse_dynamics(
             f"{names} has all velocities, in the order {list(chosen)}; name them in the order of the model, in which v is given"
         )
     scene = independent_rows(scene, q, t, rank_tol)
-    dynamics = _solve_by_program(
-        scene, q, v, a_independent, S, _weights(weights, S.shape[1], q.dtype), t, tuple(chosen), rank_tol
-    )
+    shares: Any = np.ones(S.shape[1], q.dtype)
+    if weights is not None:
+        shares = as_shape(weights, "weights", q.dtype, (S.shape[1],), of=", one per motor")
+        if is_concrete(shares) and not (np.isfinite(shares).all() and (np.asarray(shares) > 0).all()):
+            raise ValueError(f"weights is {np.asarray(shares)}; give positive numbers")
+    dynamics = _solve_by_program(scene, q, v, a_independent, S, shares, t, tuple(chosen), rank_tol)
     return require_success(dynamics, throw, lambda dynamics: _reason(dynamics, chosen))
 
 
@@ -171,15 +174,6 @@ def velocity_choice(scene: Scene, velocities: Any, argument: str) -> tuple[int, 
             f"{argument} is {velocities!r}; give names of joints or different indices of velocities, 0 to {scene.nv - 1}"
         )
     return tuple(int(i) for i in given)
-
-
-def _weights(weights, count: int, dtype):
-    if weights is None:
-        return np.ones(count, dtype)
-    weights = as_shape(weights, "weights", dtype, (count,), of=", one per motor")
-    if is_concrete(weights) and not (np.isfinite(weights).all() and (np.asarray(weights) > 0).all()):
-        raise ValueError(f"weights is {np.asarray(weights)}; give positive numbers")
-    return weights
 
 
 @entry_point

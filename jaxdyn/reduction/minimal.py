@@ -26,8 +26,7 @@ from jaxdyn.constraints.redundancy import distribute_multipliers
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, as_shape, check_state, zeros_if_none
-from jaxdyn.model.numbers import as_float
+from jaxdyn.model.arguments import Numbers, as_array, as_float, as_shape, check_state, zeros_if_none
 from jaxdyn.reduction.bases import (
     COLUMNS,
     Basis,

@@ -20,8 +20,7 @@ from jaxtyping import PyTree
 from jaxdyn.compile import compilation
 from jaxdyn.compile.executables import glue_options
 from jaxdyn.compile.jax_adapter import function_of
-from jaxdyn.model.arguments import as_array
-from jaxdyn.model.numbers import check_count, check_seed
+from jaxdyn.model.arguments import as_array, check_count, check_seed
 
 MAX_MEMBERS = 2**32  # `fold_in` takes 32 bits
 

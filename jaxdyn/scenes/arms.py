@@ -15,10 +15,9 @@ from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
 from jaxdyn.lie import se3
 from jaxdyn.model import host_math, inertia, robots
-from jaxdyn.model.arguments import Checked, Number, Row, store_leaf
+from jaxdyn.model.arguments import Checked, Number, Row, check_count, store_leaf
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
-from jaxdyn.model.numbers import check_count
 from jaxdyn.model.tree import Model
 from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.scenes.hands import finger_angles, rotation_about_z

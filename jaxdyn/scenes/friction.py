@@ -1,4 +1,4 @@
-"""Friction and unilateral contacts: stick, slip, opening and closing; a cube in a hand, a box on a table."""
+"""Contacts with friction: stick, slip, opening and closing; a disk under a link, a cube in a hand, a box on a table."""
 
 from typing import Any
 
@@ -6,12 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import rolling_sphere
 from jaxdyn.contact.cones import friction_cone, surface_cone, wrench_cone
 from jaxdyn.contact.unilateral import UnilateralContact, gap_contact, ground_contact
+from jaxdyn.geometry.immersion import constrain_by_immersion
 from jaxdyn.grasp import Grasp, contact, point_contacts
 from jaxdyn.model import host_math, inertia, robots
 from jaxdyn.model.arguments import Number, Row
@@ -19,7 +21,8 @@ from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.topology import frame_index
 from jaxdyn.scenes._named import as_leaf, as_state, flat_moments, register_scene, solve_gram
 from jaxdyn.scenes.hands import point_velocity, quaternion_and_matrix
-from jaxdyn.systems.scene import Scene
+from jaxdyn.scenes.linkages import planar_body
+from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import MetricSystem
 
 _UP, _DOWN = ((0, 0, 0), (-jnp.pi / 2, 0, 0)), ((0, 0, 0), (jnp.pi / 2, 0, 0))  # z of a plane along y, and against it
@@ -61,21 +64,66 @@ def rough_disk_and_link(
     return Scene(builder.build(), forces=(UnilateralContact(on_link, friction[0]), ground))
 
 
-class _Toy(eqx.Module):
-    """Affine functions of the coordinates: gaps of the woodpecker, and rows of its sliding velocities."""
-
-    row: Float[Array, "3"]
-    constant: Float[Array, ""]
-
-    def __call__(self, q, t):
-        return jnp.sum(self.row.astype(q.dtype) * q) + self.constant.astype(q.dtype)
+def _tangent(s):
+    """Immersion q = (z1, theta, y1, theta2) -> configurations of a disk of radius 1 and a link tangent to it from above."""
+    z, turn, y, tilt = s
+    # The link touches the disk from above: its line has the distance 1 from the disk's centre (z, 1).
+    height = 1 + (1 + jnp.sin(tilt) * (z - y)) / jnp.cos(tilt)
+    return jnp.stack([z, jnp.ones_like(z), turn]), jnp.stack([y, height, tilt])
 
 
-class _Row(eqx.Module):
-    row: Float[Array, "3"]
+class _Applied(eqx.Module):
+    """Forces: torque on the link, friction of the link on the disk along the link, and of the ground on the disk along -x."""
 
-    def __call__(self, q, t):
-        return self.row.astype(q.dtype)
+    torque: Float[Array, ""] = eqx.field(converter=as_leaf)
+    friction: Float[Array, "2"] = eqx.field(converter=as_leaf)
+
+    def __call__(self, q, v, t):
+        s, c = jnp.sin(q[1][2]), jnp.cos(q[1][2])
+        f1, f2 = self.friction.astype(s.dtype)
+        # Both friction forces act at radius 1, which gives the torque -f1 - f2.
+        disk = jnp.stack([f1 * c - f2, -f1 * s, -f1 - f2])
+        # The contact force on the link is opposite to that on the disk; it passes along the link, without torque.
+        return disk, jnp.stack([-f1 * c, f1 * s, self.torque.astype(s.dtype)])
+
+
+def _disk_start(
+    place: Number = 0.1,
+    turn: Number = 0.0,
+    link_place: Number = -0.2,
+    tilt: Number = 0.3,
+    rates: Row = (0.4, 0.2, -0.1, 0.3),
+) -> tuple[Array, Array]:
+    return as_state([place, turn, link_place, tilt]), as_state(rates)
+
+
+@register_scene(_disk_start)
+def disk_and_link(
+    *,
+    masses: Row = (1.0, 0.6),
+    moments: Row = (0.5, 0.2),
+    torque: Number = 0.0,
+    friction: Row = (0.0, 0.0),
+    gravity: Number = 9.81,
+) -> Scene:
+    """Disk of radius 1 m on the ground under a thin tangent link: two bodies coupled by an immersion.
+
+    q = (z1, theta, y1, th2): abscissa of the disk, its angle counter-clockwise, abscissa of the link's centre of mass, the
+    link's angle CLOCKWISE from horizontal. `torque` on the link (N m, clockwise); `friction` (f1, f2), N: of the link on
+    the disk along t = (cos th2, -sin th2) and of the ground on the disk along -x. The normal forces are gone.
+
+    Source: EQUATIONS section 12 with erratum E57.
+    """
+    units = tuple(planar_body(m, moment, gravity) for m, moment in zip(masses, moments, strict=True))
+    return as_scene(constrain_by_immersion(units, _tangent, 4, force=_Applied(torque, friction)))
+
+
+def _toy_gap(row, constant, q, t):
+    return jnp.sum(row.astype(q.dtype) * q) + constant.astype(q.dtype)
+
+
+def _toy_row(row, q, t):
+    return row.astype(q.dtype)
 
 
 def _toy_metric(q, t, p):
@@ -139,8 +187,9 @@ def woodpecker(
     play, reach = sleeve_radius - pole_radius, to_spring + to_bird - beak[1]
 
     def contact(name, rate, constant, along, e):
-        gap = _Toy(as_leaf(rate), as_leaf(constant))
-        return gap_contact(gap, _Row(as_leaf(along)), friction, restitution=e, name=name)
+        # Affine functions of the coordinates: the gap, and the row of the sliding velocity.
+        gap, row = Partial(_toy_gap, as_leaf(rate), as_leaf(constant)), Partial(_toy_row, as_leaf(along))
+        return gap_contact(gap, row, friction, restitution=e, name=name)
 
     # Sliding velocity of an edge: that of the sleeve's centre and of its turn at the radius.
     edge = (1.0, sleeve_radius, 0.0)

@@ -189,9 +189,9 @@ def hand_with_disk(
 # Three fingers in space: their bases on a circle in the x-y plane, a yaw joint and two pitch joints each.
 
 
-def finger_directions(count=3):
-    """Horizontal directions, away from the axis, of the fingers (count, 3)."""
-    angles = np.pi / 2 + 2 * np.pi / count * np.arange(count)
+def finger_directions():
+    """Horizontal directions, away from the axis, of the fingers (3, 3)."""
+    angles = np.pi / 2 + 2 * np.pi / 3 * np.arange(3)
     return np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
 
 

@@ -1,15 +1,17 @@
-"""Elementary Lagrangian systems: pendulums in angles, arms, a body in Euler angles, a sliding block."""
+"""Elementary systems: particles, pendulums, arms, a body that turns freely, a box, a sliding block."""
 
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array
 
 from jaxdyn.compile.known import array_namespace
+from jaxdyn.constraints import Holonomic
 from jaxdyn.contact.unilateral import DryFriction
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia import box, displaced
-from jaxdyn.scenes._named import as_leaf, register_scene
+from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import MetricSystem
@@ -93,6 +95,61 @@ def spherical_pendulum_in_angles(*, mass: Number = 1.0, length: Number = 1.0, gr
     return Scene(LagrangianSystem(_sphere, 2, parameters=parameters, potential=_sphere_potential))
 
 
+def _rod(length, q, t):
+    """Constraint (|q|^2 - length^2) / 2, so that A = q^T and the tension is -lam length."""
+    # Squares instead of |q| - l: the rows stay defined at q = 0, where |q| has no derivative.
+    return 0.5 * (jnp.sum(q * q) - length.astype(q.dtype) ** 2)
+
+
+def _particle(q, v, t, p):
+    return 0.5 * p["mass"] * jnp.sum(v * v) - p["mass"] * p["gravity"] * q[-1]
+
+
+def _on_rod(dimension: int, mass, length, gravity) -> Scene:
+    system = LagrangianSystem(_particle, dimension, parameters={"mass": mass, "gravity": gravity})
+    return Scene(system, (Holonomic(Partial(_rod, as_leaf(length)), name="rod"),))
+
+
+def _plane_start(length: Number = 1.0, angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
+    s, c = array_namespace(angle).sin(angle), array_namespace(angle).cos(angle)
+    # The length multiplies arrays, so that it may be traced.
+    return length * as_state([s, -c]), length * rate * as_state([c, s])
+
+
+@register_scene(_plane_start)
+def pendulum_in_plane(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
+    """Plane pendulum in x and y (up): L = m |v|^2/2 - m g y, phi = (x^2 + y^2 - l^2)/2.
+
+    lam = -(m/l^2)(|v|^2 - g y); the tension of the rod is -l lam. Start: `angle` from the downward vertical and `rate`;
+    by default problem A01 of the IFToMM benchmark library, x = -1, at rest.
+
+    Source: EQUATIONS section 6, with the sign of the multiplier on the right.
+    """
+    return _on_rod(2, mass, length, gravity)
+
+
+def _spherical_start(
+    length: Number = 1.0, theta: Number = 1.0, phi: Number = 0.0, theta_rate: Number = 0.0, phi_rate: Number = 1.0
+) -> tuple[Array, Array]:
+    xp = array_namespace(theta, phi)
+    s, c, sp, cp = xp.sin(theta), xp.cos(theta), xp.sin(phi), xp.cos(phi)
+    q = length * jnp.asarray([s * cp, s * sp, -c])
+    # The derivative of the position with respect to the angles, so the velocity is on the constraint.
+    along = theta_rate * jnp.asarray([c * cp, c * sp, s]) + phi_rate * s * jnp.asarray([-sp, cp, 0.0])
+    return q, length * along
+
+
+@register_scene(_spherical_start)
+def spherical_pendulum(*, mass: Number = 1.0, length: Number = 1.0, gravity: Number = 9.81) -> Scene:
+    """Spherical pendulum in x, y and z (up): L = m |v|^2/2 - m g z, phi = (|q|^2 - l^2)/2.
+
+    lam = (m/l^2)(g z - |v|^2). Start by angles: theta from the downward vertical, phi about it.
+
+    Source: EQUATIONS sections 1 and 7.
+    """
+    return _on_rod(3, mass, length, gravity)
+
+
 def _arm_start(angles: Row = (0.3, 1.1), rates: Row = (0.7, -0.4)) -> tuple[Array, Array]:
     return _state(angles, rates)
 
@@ -168,6 +225,25 @@ def spatial_arm(
         name, axis = f"link{i + 1}", (0.0, 0.0, 1.0) if i == 0 else (-1.0, 0.0, 0.0)
         builder.add_body(name, parent, inertia=(masses[i], centres[i], moments[i]), pose=places[i], axis=axis)
         builder.add_frame(f"centre{i + 1}", name, centres[i])
+    return Scene(builder.build())
+
+
+def _free_start(rates: Row = (0.3, 0.8, -0.5)) -> tuple[Array, Array]:
+    return as_state([1.0, 0.0, 0.0, 0.0]), as_leaf(rates)
+
+
+@register_scene(_free_start)
+def free_body(*, moments: Row = (1.0, 2.0, 3.0)) -> Scene:
+    """Rigid body that turns freely about its centre of mass: I w' = (I w) x w, by Jacobi's elliptic functions.
+
+    q = (w, x, y, z), a unit quaternion, v = angular velocity in the body's axes, principal ones; `moments`, kg m^2.
+    Start: turned by nothing, with body `rates` (rad/s).
+
+    Source: Celledoni, Fasso, Safstrom & Zanna (2008), The exact computation of the free rigid body motion.
+    """
+    builder = ModelBuilder("free body", gravity=None)
+    # The mass at the fixed point has no effect without gravity.
+    builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), tuple(moments)))
     return Scene(builder.build())
 
 

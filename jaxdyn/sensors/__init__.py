@@ -10,17 +10,17 @@ from jaxdyn.sensors.base import Noise as Noise
 from jaxdyn.sensors.base import Sensor as Sensor
 from jaxdyn.sensors.base import measure as measure
 from jaxdyn.sensors.base import record as record
-from jaxdyn.sensors.frames import Accelerometer as Accelerometer
-from jaxdyn.sensors.frames import FramePose as FramePose
-from jaxdyn.sensors.frames import FrameVelocity as FrameVelocity
-from jaxdyn.sensors.frames import Gyroscope as Gyroscope
-from jaxdyn.sensors.frames import Imu as Imu
-from jaxdyn.sensors.frames import Velocimeter as Velocimeter
-from jaxdyn.sensors.joints import ContactForce as ContactForce
-from jaxdyn.sensors.joints import Encoder as Encoder
-from jaxdyn.sensors.joints import ForceTorque as ForceTorque
-from jaxdyn.sensors.joints import Tachometer as Tachometer
-from jaxdyn.sensors.joints import Touch as Touch
+from jaxdyn.sensors.instruments import Accelerometer as Accelerometer
+from jaxdyn.sensors.instruments import ContactForce as ContactForce
+from jaxdyn.sensors.instruments import Encoder as Encoder
+from jaxdyn.sensors.instruments import ForceTorque as ForceTorque
+from jaxdyn.sensors.instruments import FramePose as FramePose
+from jaxdyn.sensors.instruments import FrameVelocity as FrameVelocity
+from jaxdyn.sensors.instruments import Gyroscope as Gyroscope
+from jaxdyn.sensors.instruments import Imu as Imu
+from jaxdyn.sensors.instruments import Tachometer as Tachometer
+from jaxdyn.sensors.instruments import Touch as Touch
+from jaxdyn.sensors.instruments import Velocimeter as Velocimeter
 
 
 def __dir__() -> list[str]:

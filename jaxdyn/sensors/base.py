@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.constraints.redundancy import add_constraints
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
@@ -20,6 +21,8 @@ from jaxdyn.model.arguments import (
     DType,
     Numbers,
     as_array,
+    as_float,
+    as_number,
     check_mapping,
     check_name,
     check_state,
@@ -27,7 +30,6 @@ from jaxdyn.model.arguments import (
     state_dtype,
     zeros_if_none,
 )
-from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
@@ -228,7 +230,7 @@ def motion_at(scene: Scene, q, v, tau, t, thrusts, forces: Array) -> Motion:
         return Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t, thrusts)
     smooth = tuple(force for force in scene.forces if not isinstance(force, UnilateralContact))
     rows = constraint_jacobian(Scene(scene.system, tuple(touching.values())), q, t)
-    dynamics = constrained_dynamics(Scene(scene.system, scene.constraints, smooth), q, v, tau + matmul(forces, rows), t)
+    dynamics = constrained_dynamics(add_constraints(scene, (), smooth), q, v, tau + matmul(forces, rows), t)
     multipliers = jnp.concatenate([dynamics.multipliers, forces])
     places = layout(Scene(scene.system, tuple(touching.values())))
     contacts = {
@@ -240,7 +242,7 @@ def motion_at(scene: Scene, q, v, tau, t, thrusts, forces: Array) -> Motion:
 def with_contacts(scene: Scene, forces: Sequence = ()) -> Scene:
     """Scene with the rows of its unilateral contacts behind its own, and other forces."""
     touching = [force.contact for force in scene.forces if isinstance(force, UnilateralContact)]
-    return Scene(scene.system, (*scene.constraints, *touching), forces)
+    return add_constraints(scene, touching, forces)
 
 
 def check_contacts(scene: Scene, contacts: object, rows: tuple[int, ...], dtype) -> Array:

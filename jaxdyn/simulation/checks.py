@@ -15,10 +15,9 @@ from jaxtyping import Array, Bool
 from jaxdyn.compile.known import is_concrete, once
 from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
-from jaxdyn.constraints.branches import count_free
 from jaxdyn.constraints.rank import LEAST_GAP
 from jaxdyn.constraints.redundancy import holds_rows, keep_rows
-from jaxdyn.constraints.selection import most_rounding, rows_and_doubts, select_rows
+from jaxdyn.constraints.selection import count_free, most_rounding, rows_and_doubts, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.contact.shapes import LowestCorner
 from jaxdyn.dynamics.quantities import mass_matrix

@@ -13,13 +13,14 @@ from jaxdyn.constraints.base import constraint_jacobian, position_residual, velo
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.constraints.projection import project_state
 from jaxdyn.constraints.rank import regular_gram
+from jaxdyn.constraints.redundancy import add_constraints
 from jaxdyn.contact import coulomb
 from jaxdyn.contact.unilateral import DryFriction, WithModes
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import warn
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.hybrid.modes import elements_of, extend, force_at, normal_load
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
@@ -340,7 +341,7 @@ def rests_at(contacts: Contacts, scene: Scene, q, v, t) -> Array:
 def pose(contacts: Contacts, scene: Scene, q, v, z, tau, t, h) -> _Problem:
     """Problem of a step from a state."""
     whole = extend(scene)
-    bare = Scene(scene.system, scene.constraints, whole.forces)
+    bare = add_constraints(scene, (), whole.forces)
     flow, end = _flow(bare, q, v, z, tau, t, h), t + h
     place, metric, start = displace(scene.system, flow.place, 0.5 * h * v), flow.metric, flow.acceleration(v, v)[0]
     free = v + h * start

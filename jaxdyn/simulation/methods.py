@@ -29,9 +29,8 @@ from jaxdyn.constraints.redundancy import most_opening, opening_of_redundant, op
 from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, state_dtype
+from jaxdyn.model.arguments import Number, Numbers, as_float, check_count, state_dtype
 from jaxdyn.model.configuration import neutral
-from jaxdyn.model.numbers import as_float, check_count
 from jaxdyn.model.tree import Model
 from jaxdyn.reduction.bases import (
     Basis,

@@ -14,7 +14,7 @@ from jaxdyn.compile.batch import map_rows
 from jaxdyn.compile.known import Known
 from jaxdyn.constraints.codes import first_of
 from jaxdyn.constraints.rank import LEAST_GAP
-from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, row_mask, rows_of
+from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, rows_of
 from jaxdyn.constraints.selection import most_rounding, select_rows
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import (
@@ -267,7 +267,7 @@ def _redundancy(run: _Run, y, q, ts, reached) -> dict[str, Array]:
         return {}
     gaps = map_rows(lambda row: gap_of_redundant(run.scene_at(row[0]), *row[1:]), (y, q, ts))
     return {
-        "redundant_rows": jnp.sum(1 - row_mask(run.scene)).astype(jnp.int32),
+        "redundant_rows": jnp.sum(1 - run.scene.kept_rows.kept).astype(jnp.int32),
         # Rows that were not reached hold the start, and are none of the motion's.
         "redundant_gap": jnp.max(jnp.where(reached, gaps, jnp.zeros_like(gaps))),
     }

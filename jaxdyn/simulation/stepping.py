@@ -224,8 +224,7 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
     def advance(q, v, tau, t, *z):
         whole, size = scene, length / np.asarray(substeps, length.dtype)
         if selects_rows:
-            kept = keep_rows(bare, hide_unclear(select_rows(bare, q, t, None)))
-            whole = Scene(scene.system, kept.constraints, scene.forces)
+            whole = keep_rows(scene, hide_unclear(select_rows(bare, q, t, None)))
         # Known numbers stay numpy's: an array of JAX would be an argument more of the program around the step.
         energy = np.asarray(smoothing, q.dtype) if is_concrete(smoothing) else jnp.asarray(smoothing, q.dtype)
 

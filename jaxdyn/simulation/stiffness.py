@@ -172,7 +172,7 @@ def _linearize(scene: Scene, q, v, t, control, state) -> Float[Array, "n n"]:
     mass = mass_matrix(system, q, t)
     unit = jnp.eye(n, dtype=mass.dtype)
     if scene.constraints:
-        bare = Scene(system, scene.constraints)
+        bare = scene.without_forces
         inverse = jax.jacfwd(lambda f: constrained_dynamics(bare, q, v, f, t).acceleration)(jnp.zeros_like(v))
         tangent = matmul(inverse, mass)
     else:

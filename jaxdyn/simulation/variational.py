@@ -45,7 +45,7 @@ from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie import se2, se3, so3
 from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import Number
-from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.topology import SCREW_KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.methods import Force, Free, Multipliers, Q, State, V
 from jaxdyn.simulation.options import Solver, Stepsize, is_step_length

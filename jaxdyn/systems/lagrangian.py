@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.compile.known import is_known
-from jaxdyn.model.arguments import Checked, Function, Number
-from jaxdyn.model.numbers import check_count
+from jaxdyn.model.arguments import Checked, Function, Number, check_count
 from jaxdyn.systems.scene import as_pytree
 from jaxdyn.systems.system import System, as_parameter, check_mass_matrix, describe_state, evaluate_callback
 

@@ -146,6 +146,8 @@ class Scene(eqx.Module):
     constraints: tuple = ()
     forces: tuple = ()
     cones: Any = None
+    # The rows of the constraints that count (`jaxdyn.constraints.redundancy.KeptRows`), None for all of them.
+    kept_rows: Any = None
 
     def __init__(
         self,
@@ -160,6 +162,7 @@ class Scene(eqx.Module):
         # Static wrappers let plain functions pass through `jit` and `vmap` as part of the scene.
         self.forces = tuple(as_pytree(f, f"forces[{i}]") for i, f in enumerate(_sequence(forces, "forces")))
         self.cones = cones
+        self.kept_rows = None
 
     def __str__(self) -> str:
         return scene_lines(self)
@@ -177,7 +180,13 @@ class Scene(eqx.Module):
     @property
     def without_forces(self) -> "Scene":
         """The system with its constraints alone: what rows, projections and assembly depend on."""
-        return Scene(self.system, self.constraints)
+        return Scene(self.system, self.constraints).with_kept_rows(self.kept_rows)
+
+    def with_kept_rows(self, rows: Any) -> "Scene":
+        """The scene with another choice of the rows that count, None for all of them."""
+        if rows is self.kept_rows:
+            return self
+        return eqx.tree_at(lambda scene: scene.kept_rows, self, rows, is_leaf=lambda x: x is None)
 
     @property
     def rounding(self) -> float:

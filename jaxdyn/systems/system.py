@@ -18,9 +18,8 @@ from jaxtyping import Array, Float, PyTree
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_known
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Number, batch_hint
+from jaxdyn.model.arguments import Checked, Function, Number, batch_hint, check_count
 from jaxdyn.model.configuration import configuration_rate, difference, integrate, joint_rates, normalize
-from jaxdyn.model.numbers import check_count
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree

@@ -502,26 +502,6 @@ def test_assembling_from_afar_is_differentiable(in_plane):
     assert_close(second[1], (forward[2] - forward[0]) / (2 * h), 1e-6)
 
 
-@pytest.mark.long
-def test_a_batch_of_mechanisms_of_different_lengths():
-    """One vmap over lengths equals a loop, and every lane assembles."""
-    lengths = jnp.linspace(2.0, 3.0, 50)
-    base = scenes.four_bar()
-
-    def solve(coupler):
-        closing = base.constraints[0]
-        moved = type(closing)(**{**vars(closing), "pose_a": closing.pose_a.at[0, 3].set(coupler)})
-        scene = Scene(base.system, (moved,))
-        state = assemble(scene, jnp.asarray([1.0, -0.3, 1.7]), jnp.asarray([1.0, 0.0, 0.0]))
-        return state.residual, constrained_dynamics(scene, state.q, state.v).acceleration
-
-    residual, a = quick(jax.vmap(solve))(lengths)
-    assert float(residual.max()) < 1e-12
-    one = quick(solve)
-    for i in (0, 17, 49):
-        assert_close(a[i], one(lengths[i])[1], 1e-10)
-
-
 def test_a_wheel_built_from_bodies_moves_as_the_disk_in_coordinates():
     """Planar joint and axle with `rolling_wheel` against the Lagrangian of Murray, Li & Sastry."""
     from jaxdyn.model.builder import ModelBuilder

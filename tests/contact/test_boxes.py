@@ -67,20 +67,6 @@ def at(angle, size):
     return scenes.box_on_table.start(tilt=angle, rate=rate, height=HEIGHT, size=size)
 
 
-def test_the_cone_of_the_base_has_the_printed_rows():
-    """Caron, Pham & Nakamura: the 16 rows for X, Y, mu, those of torques divided by X."""
-    X, Y, mu = 0.1, 0.08, 0.4
-    s = mu * (X + Y)
-    printed = [
-        (1, 0, -mu, 0, 0, 0), (-1, 0, -mu, 0, 0, 0), (0, 1, -mu, 0, 0, 0), (0, -1, -mu, 0, 0, 0),
-        (0, 0, -Y, 1, 0, 0), (0, 0, -Y, -1, 0, 0), (0, 0, -X, 0, 1, 0), (0, 0, -X, 0, -1, 0),
-        (-Y, -X, -s, mu, mu, -1), (-Y, X, -s, mu, -mu, -1), (Y, -X, -s, -mu, mu, -1), (Y, X, -s, -mu, -mu, -1),
-        (Y, X, -s, mu, mu, 1), (Y, -X, -s, mu, -mu, 1), (-Y, X, -s, -mu, mu, 1), (-Y, -X, -s, -mu, -mu, 1),
-    ]  # fmt: skip
-    scale = np.array([1.0] * 4 + [X] * 12)[:, None]
-    np.testing.assert_allclose(scenes.box_on_table().cones.rows * scale, printed, atol=1e-15)
-
-
 @pytest.fixture(scope="module")
 def solve():
     """Wrench at the base and acceleration of a batch of states, of one size of the box."""

@@ -7,7 +7,6 @@ import pytest
 from pinocchio_bridge import quick
 from scipy.optimize import linprog
 
-import jaxdyn as jd
 from jaxdyn.contact import friction_cone, surface_cone, wrench_cone, wrench_cone_of_polygon
 
 X, Y, MU = 0.11, 0.05, 0.6
@@ -85,15 +84,10 @@ def test_rectangle_is_the_closed_form_of_the_yaw_torque():
     np.testing.assert_allclose((wrenches @ np.asarray(wrench_cone(X, Y, MU)).T).max(1), np.max(bounds, 0), atol=1e-14)
 
 
-def test_rectangle_agrees_with_a_linear_program():
-    disputed, inside = agree_with_program(np.asarray(wrench_cone(X, Y, MU)), CORNERS, MU, 400, 2)
-    assert disputed == 0 and 50 < inside < 350
-
-
-@pytest.mark.slow
-def test_rectangle_agrees_with_a_linear_program_on_many_wrenches():
-    disputed, inside = agree_with_program(np.asarray(wrench_cone(X, Y, MU)), CORNERS, MU, 2000, 3)
-    assert disputed == 0 and inside > 500
+@pytest.mark.parametrize("count, seed", [(400, 2), pytest.param(2000, 3, marks=pytest.mark.slow)])
+def test_rectangle_agrees_with_a_linear_program(count, seed):
+    disputed, inside = agree_with_program(np.asarray(wrench_cone(X, Y, MU)), CORNERS, MU, count, seed)
+    assert disputed == 0 and count / 8 < inside < 7 * count / 8
 
 
 def test_polygon_of_a_rectangle_is_the_rectangle():
@@ -211,8 +205,3 @@ BAD = [
 def test_bad_input_is_refused(call, match):
     with pytest.raises(ValueError, match=match):
         call()
-
-
-def test_the_package_is_exported():
-    assert jd.contact.wrench_cone is wrench_cone
-    assert jd.contact.wrench_basis is jd.grasp.wrench_basis

@@ -150,17 +150,6 @@ def test_twists_are_those_of_the_relative_pose(name):
     np.testing.assert_allclose(pose[:3, :3] @ computed.finger.frame[:, 2], -computed.object.frame[:, 2], atol=1e-14)
 
 
-@pytest.mark.slow
-def test_derivatives_of_the_pose_are_its_differences():
-    o, f = PAIRS["ellipsoid on ellipsoid"]
-    step, direction = 1e-5, jnp.array([0.3, -0.5, 0.2, 0.9, 0.4])
-    steps = jnp.array([-2.0, -1.0, 1.0, 2.0])
-    poses = quick(jax.vmap(lambda k: relative_pose(o, f, ETA + k * step * direction)))(steps)
-    rate = (poses[0] - 8 * poses[1] + 8 * poses[2] - poses[3]) / (12 * step)
-    twist = se3.vee(se3.inverse(relative_pose(o, f, ETA)) @ rate)
-    np.testing.assert_allclose(montana(o, f, ETA).J_F @ direction, twist, atol=1e-10)
-
-
 def test_rolling_returns_without_slip_and_spin():
     """Contact coordinates integrated by Runge and Kutta: the twist of the poses on the way is the one that was asked for."""
     o, f = PAIRS["ellipsoid on ellipsoid"]

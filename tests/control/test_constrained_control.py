@@ -281,55 +281,6 @@ def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("contact", ["frictionless", "rolling"])
-def test_arm_on_a_sphere(contact):
-    """The documents' arm, sliding and rolling: contact coordinates, or rolling rates, follow; the normal force as wanted."""
-    scene = scenes.sphere_arm(contact=contact)
-    model = scene.system
-    q0, v0 = scenes.sphere_arm.start(contact=contact, rolling=(0.2, -0.1))
-    if contact == "frictionless":
-        # The direction of the tip from the sphere, and its own attitude.
-        center = jnp.asarray([0.5, 0.0, 0.0])
-        home = jd.frame_pose(model, q0, "tip")[:3, :3]
-
-        def task(q):  # pyright: ignore[reportRedeclaration]
-            pose = jd.frame_pose(model, q, "tip")
-            return jnp.concatenate([(pose[:3, 3] - center)[:2] / 0.18, jd.so3.log(home.T @ pose[:3, :3])])
-
-        goal = task(q0) + jnp.asarray([0.05, -0.04, 0.1, 0.0, -0.1])
-        law = jd.control.HybridForce(scene, task, goal, KP, KD, force=jnp.asarray([5.0]), ki=2.0)
-    else:
-
-        def task(q, v):
-            return (jd.body_jacobian(model, q, "tip") @ v)[4:]
-
-        goal = task(q0, v0) + jnp.asarray([0.3, -0.2])
-        law = jd.control.HybridForce(
-            scene, task, goal, 4.0, of="velocity", force=jnp.asarray([5.0, 0.3, -0.2, 0.01]), ki=2.0
-        )
-    ts = TS[:11]
-    solution = jd.simulate(scene, q0, v0, ts, control=law, stepsize=0.01, outputs=("multipliers",))
-    lam = np.asarray(law.reference_force(q0, 0.0))
-    np.testing.assert_allclose(solution.multipliers, np.tile(lam, (ts.size, 1)), atol=1e-7)
-    if contact == "frictionless":
-        errors = np.asarray(jax.vmap(lambda q: task(q) - goal)(solution.q))
-        rate = jax.jvp(task, (q0,), (v0,))[1]
-        np.testing.assert_allclose(
-            errors, decayed(np.asarray(ts), errors[0], np.asarray(rate)), atol=1e-6
-        )  # RK4, 10 ms
-    else:
-        errors = np.asarray(jax.vmap(lambda q, v: task(q, v) - goal)(solution.q, solution.v))
-        np.testing.assert_allclose(errors, errors[0] * np.exp(-4.0 * np.asarray(ts))[:, None], atol=1e-6)
-    # The contact that the documents' kinematics see: the distance of the centres.
-    pose = jax.vmap(lambda q: jd.frame_pose(model, q, "tip"))(solution.q)
-    gap = np.linalg.norm(np.asarray(pose)[:, :3, 3] - np.array([0.5, 0.0, 0.0]), axis=1)
-    at = jd.contact.montana(
-        jd.contact.Sphere(0.15, poles="y"), jd.contact.Sphere(0.03), jnp.asarray([0.2, -0.1, 0.15, 0.1, 0.3])
-    )
-    np.testing.assert_allclose(gap, np.linalg.norm(at.g_of[:3, 3]), atol=1e-9)
-
-
-@pytest.mark.slow
 def test_gains_are_tuned_over_perturbed_systems():
     """The cost of the page on tuning: its gradient in three gains against differences, and a step that lowers it."""
     from benchmarks.control_figures import MASSES, tuning_cost

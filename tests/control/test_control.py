@@ -166,18 +166,6 @@ def test_gains_are_leaves(arm):
     assert values[0] != values[1]
 
 
-def test_torque_changes_with_a_gain_as_the_formula_says(arm):
-    """d tau / d kp = -M e."""
-
-    @quick
-    def both(kp):
-        torque = lambda kp: jd.control.ComputedTorque(arm, wave, kp, 5.0)(Q0, V0)  # noqa: E731
-        return jax.jacfwd(torque)(kp), -jd.mass_matrix(arm, Q0) @ (Q0 - wave(0.0))
-
-    forward, formula = both(6.0)
-    np.testing.assert_allclose(forward, formula, rtol=1e-10)
-
-
 @pytest.mark.parametrize("differentiate", [jax.jacfwd, jax.jacrev])
 def test_rest_at_the_target_has_finite_gradients(differentiate):
     """Zero error, zero velocity and a rank of two for three rows: no NaN."""

@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.constraints.base import position_residual
-from jaxdyn.control.box_qp import minimize_in_box
+from jaxdyn.contact.qp import minimize_in_box
 
 RNG = np.random.default_rng(4)
 A, B = np.eye(3) + 0.2 * RNG.normal(size=(3, 3)), RNG.normal(size=(3, 2))
@@ -79,18 +79,6 @@ def test_limits_are_those_of_a_quadratic_program():
     np.testing.assert_allclose(plan.us[:, 0], want.x, atol=1e-5)  # SciPy's own tolerance on its optimality
     assert np.isclose(plan.us, -1.5).any() and np.isclose(plan.us, 1.0).any()
     assert np.all((plan.gains == 0).all((1, 2))[np.isclose(plan.us[:, 0], -1.5)])
-
-
-def test_quadratic_programs_in_a_box():
-    """Optimality conditions of random programs; a batch."""
-    rng = np.random.default_rng(0)
-    roots, g = rng.normal(size=(50, 5, 5)), 3 * rng.normal(size=(50, 5))
-    H = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(5)
-    x, free, *_ = quick(jax.vmap(lambda H, g: minimize_in_box(H, g, -jnp.ones(5), 0.5 * jnp.ones(5))))(H, g)
-    slope = np.einsum("nij,nj->ni", H, x) + g
-    assert np.all((x >= -1) & (x <= 0.5))
-    np.testing.assert_allclose(np.where(free, slope, 0), 0, atol=1e-9)
-    assert np.all(np.where(free, True, np.where(np.isclose(x, -1), slope > 0, slope < 0)))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])

@@ -1,13 +1,11 @@
 """Robots with legs: the centre of mass, forces of feet and inverse dynamics without a motor at the base, against Pinocchio."""
 
-import os
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_bridge import ROBOT_FILES, assert_close, load_both, quick, random_states
+from pinocchio_bridge import assert_close, load_both, quick, random_states
 
 import jaxdyn as jd
 
@@ -146,26 +144,6 @@ def _local_wrench(source, contact, data, one):
 
 
 @pytest.mark.long
-def test_solo_stands_with_forces_in_its_cones(solo):
-    """The torques of the program, applied: the held robot does not move, and the multipliers are the program's forces."""
-    model, _, _, q, feet = solo
-    at_rest = jnp.zeros(model.nv)
-    scene = jd.Scene(model, [one.hold(model, q) for one in feet])
-
-    @quick
-    def stand(q):
-        wanted = jd.control.underactuated_inverse_dynamics(model, q, at_rest, at_rest, feet, preload=0.5)
-        return wanted, jd.constrained_dynamics(scene, q, at_rest, wanted.tau)
-
-    wanted, computed = stand(q)
-    assert bool(wanted.success) and wanted.margins.min() > 0.5 - 1e-6
-    np.testing.assert_allclose(computed.acceleration, 0.0, atol=1e-8)
-    np.testing.assert_allclose(computed.multipliers, wanted.forces, atol=1e-7)
-    weight = float(model.inertias[:, 0].sum()) * 9.81
-    np.testing.assert_allclose(sum(f[2] for f in wanted.by_foot().values()), weight, rtol=1e-7)
-
-
-@pytest.mark.long
 def test_what_the_feet_cannot_carry_has_a_code(solo):
     """A wanted fall faster than free fall asks feet to pull; a limit on torques that is too low."""
     model, _, _, q, feet = solo
@@ -254,7 +232,3 @@ def test_bad_input_is_refused(solo, call, message):
 
 def _still(model):
     return jnp.zeros(model.nv), jnp.zeros(model.nv)
-
-
-def test_files_of_all_robots_are_there():
-    assert all(os.path.exists(ROBOT_FILES[file]) for file in ROBOTS)

@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree
@@ -143,19 +142,15 @@ def test_arnold_form_of_a_moving_body():
     assert_close(jd.geometry.arnold_form(inertia, c, V) @ inertia @ b, jd.se3.ad_apply(V, b) @ inertia @ c, 1e-12)
 
 
+@pytest.mark.usefixtures("as_users_have_it")
 def test_arnold_form_refuses():
     eye = jnp.eye(3)
     with pytest.raises(ValueError, match=r"inertia has shape \(4, 4\); give \(3, 3\) or \(6, 6\)"):
         jd.geometry.arnold_form(jnp.eye(4), jnp.zeros(4), jnp.zeros(4))
-    jaxtyping.config.update("jaxtyping_disable", True)  # what users meet
-    try:
-        with pytest.raises(ValueError, match=r"a has shape \(6,\), expected \(3,\)"):
-            jd.geometry.arnold_form(eye, jnp.zeros(3), jnp.zeros(6))
-        assert_close(
-            jd.geometry.arnold_form([[2, 0, 0], [0, 1, 0], [0, 0, 1]], [1, 0, 2], [0, 1, 1]), [-1.0, -2.0, 2.0], 1e-14
-        )
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
+    with pytest.raises(ValueError, match=r"a has shape \(6,\), expected \(3,\)"):
+        jd.geometry.arnold_form(eye, jnp.zeros(3), jnp.zeros(6))
+    form = jd.geometry.arnold_form([[2, 0, 0], [0, 1, 0], [0, 0, 1]], [1, 0, 2], [0, 1, 1])
+    assert_close(form, [-1.0, -2.0, 2.0], 1e-14)
     assert np.isnan(jd.geometry.arnold_form(-eye, jnp.ones(3), jnp.ones(3))).all()
 
 

@@ -166,14 +166,6 @@ def test_rolling_motion_is_that_of_the_printed_equations(solved):
     np.testing.assert_allclose(at["multipliers"] @ at["rows"], lam @ A1, atol=1e-10)
 
 
-@pytest.mark.slow
-def test_rolling_reaches_all_contact_coordinates_unless_radii_are_equal():
-    for tip, ranks in ((TIP, (2, 3, 5)), (RADIUS, (2, 2))):
-        scene = scenes.sphere_arm(contact="rolling", tip_radius=tip)
-        q, _ = scenes.sphere_arm.start(contact="rolling", tip_radius=tip)
-        assert jd.reduction.involutive(scene, q).ranks == ranks
-
-
 def test_coordinates_are_five_and_two():
     for kind, count in zip(KINDS, (5, 2), strict=True):
         assert jd.reduction.tangent_basis(scenes.sphere_arm(contact=kind), start(kind)[0]).shape == (6, count)

@@ -139,16 +139,6 @@ def test_what_the_feet_cannot_carry_has_a_code(biped, evaluated):
     np.testing.assert_allclose(missing, jd.control.missing_wrench(model, q, at_rest, a, feet, passive=BASE), atol=1e-6)
 
 
-@pytest.mark.slow
-def test_a_motion_that_the_feet_cannot_carry_ends(biped):
-    """The jump sideways, simulated: a foot slips at the start."""
-    model, q, feet, _ = biped
-    law, at_rest = law_of(biped, (2.0, 0.0, 0.0)), jnp.zeros(model.nv)
-    scene = jd.control.standing(model, q, feet)
-    lost = jd.simulate(scene, q, at_rest, TS, control=law, stepsize=0.02, throw=False)
-    assert lost.result == jd.RESULTS.contact_lost
-
-
 def test_feet_come_first(biped, evaluated):
     """Straight legs cannot lift the trunk: the feet stay where they are, and the shortfall is what is asked for in vain."""
     model, q, feet, _ = biped

@@ -4,12 +4,10 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
-from jax.test_util import check_grads
 from pinocchio_bridge import (
     as_dtype,
     assert_close,
@@ -383,22 +381,6 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
         )
 
 
-@pytest.mark.slow
-def test_batch_equals_loop_and_eager_equals_jit():
-    model = TREES["floating"]()
-    states = random_states(model, 5, 2)
-    batch = PROGRAM(model, *states)
-    one = quick(values)
-    for s in range(3):
-        single = one(model, *(x[s] for x in states))
-        for key in batch:
-            assert_close(batch[key][s], single[key], 1e-12, key)
-    small = random_tree(3, ["revolute", "revolute"])
-    q, v, _, tau, _ = (x[0] for x in random_states(small, 1, 2))
-    compiled = quick(matrix_form.forward_dynamics)(small, q, v, tau)
-    assert_close(matrix_form.forward_dynamics(small, q, v, tau), compiled, 1e-12)
-
-
 LEAVES = ("home", "screws", "inertias", "gravity", "armature")
 
 
@@ -421,18 +403,6 @@ def _derivative_case():
 
 def _total(model, leaves, q, v, tau):
     return jnp.sum(jnp.tanh(matrix_form.forward_dynamics(model.replace(**leaves), q, v, tau) / 10))
-
-
-@pytest.mark.slow
-def test_forward_dynamics_by_check_grads():
-    model, at = _derivative_case()
-    total = functools.partial(_total, model)
-    jax.config.update("jax_disable_most_optimizations", True)  # as `quick`, which does not nest
-    try:
-        # Finite differences of second order are good to 1e-4.
-        check_grads(jax.jit(total), at, order=2, modes=("fwd", "rev"), atol=1e-4, rtol=1e-4)
-    finally:
-        jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.mark.long
@@ -496,9 +466,8 @@ def test_derivatives_are_finite_at_rest_and_without_mass(kinds):
         assert np.isfinite(leaf).all()
 
 
-def test_refusals(monkeypatch):
-    # Annotations would refuse most of these before the function does.
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+@pytest.mark.usefixtures("as_users_have_it")  # annotations would refuse most of these before the function does
+def test_refusals():
     model = random_tree(1, ["revolute", "spherical"])
     q, v = jnp.asarray([0.0, 1, 0, 0, 0]), jnp.zeros(4)
     with pytest.raises(ValueError, match=r"q has shape \(4,\), expected \(5,\)"):

@@ -1,5 +1,4 @@
-"""The matrix form in its two frames, and what it gives in closed form: link frames against the tree frame, printed
-mechanisms, derivatives of the mass matrix."""
+"""The matrix form in its two frames: link frames against the tree frame, block identities, derivatives of the mass matrix."""
 
 import functools
 
@@ -7,9 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import assert_close, load_robot, make_model, quick, random_states, random_tree
+from pinocchio_bridge import assert_close, load_robot, quick, random_states, random_tree
 
-import jaxdyn as jd
 from jaxdyn.dynamics import kinematics
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics import world_frame as matrix_form
@@ -100,72 +98,6 @@ def test_tip_wrench_by_virtual_power():
     zero = jnp.zeros(model.nv)
     tau = quick(matrix_form.inverse_dynamics)(model, q[0], v[0], zero, external)
     assert_close(tau, world["bias_force"][0] + link["Jt"][0].T @ wrench, 1e-12)
-
-
-@quick
-def printed_quantities(model, q, v, a):
-    return (
-        matrix_form.mass_matrix(model, q),
-        dynamics.coriolis_matrix(model, q, v) @ v,
-        dynamics.gravity_force(model, q),
-        dynamics.first_kind_symbols(model, q),
-        matrix_form.inverse_dynamics(model, q, v, a),
-        jd.potential_energy(model, q),
-    )
-
-
-def test_planar_two_link_arm_as_printed():
-    # EQUATIONS section 1, planar 2R: numbers printed there.
-    (m1, m2), l1, (r1, r2), (i1, i2) = (1, 0.8), 1.0, (0.5, 0.4), (0.1, 0.05)
-    home = np.stack([np.eye(4)] * 2)
-    home[1, 0, 3] = l1
-    # About the body origin: I + m r^2 across the link.
-    bodies = [[m, m * r, 0, 0, i, 0, i + m * r**2, 0, 0, i + m * r**2] for m, r, i in ((m1, r1, i1), (m2, r2, i2))]
-    model = make_model([-1, 0], home, [[0, 0, 0, 0, 0, 1]] * 2, bodies, gravity=None)
-    q, v, a = jnp.asarray([0.2, np.pi / 3]), jnp.asarray([1.0, 2.0]), jnp.asarray([1.0, -1.0])
-    mass, coriolis, _, symbols, tau, _ = printed_quantities(model, q, v, a)
-    assert_close(mass, [[1.648, 0.338], [0.338, 0.178]])
-    # Eight digits are printed.
-    printed = np.array([[-0.55425626, -0.83138439], [0.27712813, 0]])
-    assert_close(coriolis, printed @ v, 1e-7)
-    assert_close(tau, [-0.90702503, 0.43712813], 1e-7)
-    assert_close(jnp.einsum("ijk,k->ij", symbols, v), printed, 1e-7)
-    b = m2 * l1 * r2 * np.sin(np.pi / 3)
-    assert_close(symbols, [[[0, -b], [-b, -b]], [[b, 0], [0, 0]]])
-
-
-def test_three_joint_arm_as_printed():
-    # EQUATIONS section 1, 3-dof arm: closed forms and numbers printed there, by the world's axes.
-    l0, l1, r0, r1, r2, g = 0.5, 0.4, 0.2, 0.25, 0.15, 9.81
-    m, ix, iy, iz = (3, 2, 1), (0.01, 0.03, 0.02), (0.02, 0.01, 0.015), (0.03, 0.04, 0.025)
-    home = np.stack([np.eye(4)] * 3)
-    home[1, 2, 3], home[2, 1, 3] = l0, l1
-    centers = [[0, 0, r0], [0, r1, 0.0], [0, r2, 0.0]]
-    bodies = []
-    for i, (x, y, z) in enumerate(centers):
-        xx, yy, zz = ix[i] + m[i] * (y * y + z * z), iy[i] + m[i] * (x * x + z * z), iz[i] + m[i] * (x * x + y * y)
-        bodies.append([m[i], m[i] * x, m[i] * y, m[i] * z, xx, 0, yy, 0, 0, zz])
-    screws = [[0, 0, 0, 0, 0, 1], [0, 0, 0, -1, 0, 0], [0, 0, 0, -1, 0, 0]]
-    model = make_model([-1, 0, 1], home, screws, bodies, gravity=(0, 0, -g))
-    q, v = jnp.asarray([0.3, 0.4, -0.7]), jnp.asarray([0.5, -0.6, 0.8])
-    mass, coriolis, gravity, symbols, _, potential = map(np.asarray, printed_quantities(model, q, v, v))
-    # Nine digits are printed.
-    assert_close(mass[[0, 1, 1, 2], [0, 1, 2, 2]], [0.457483792, 0.449281062, 0.088390531, 0.0425], 2e-9)
-    assert_close(mass[0, 1:], [0, 0], 1e-12)
-    assert_close(coriolis, [0.08628446, 0.01508056, -0.02029184], 2e-7)
-    assert_close(gravity, [0, -9.53782516, -1.40577764], 1e-9)
-    c2, s2, s3 = np.cos(0.4), np.sin(0.4), np.sin(-0.7)
-    c23, s23, t = np.cos(-0.3), np.sin(-0.3), m[2] * (l1 * c2 + r2 * np.cos(-0.3))
-    want = np.zeros((3, 3, 3))
-    a = (iy[1] - iz[1] - m[1] * r1**2) * c2 * s2 + (iy[2] - iz[2]) * c23 * s23 - t * (l1 * s2 + r2 * s23)
-    b = (iy[2] - iz[2]) * c23 * s23 - t * r2 * s23
-    want[0, 0, 1], want[0, 1, 0], want[1, 0, 0] = a, a, -a
-    want[0, 0, 2], want[0, 2, 0], want[2, 0, 0] = b, b, -b
-    want[1, 1, 2] = want[1, 2, 1] = want[1, 2, 2] = -m[2] * l1 * r2 * s3
-    want[2, 1, 1] = m[2] * l1 * r2 * s3
-    assert_close(symbols, want)
-    h = (r0, l0 - r1 * s2, l0 - l1 * s2 - r2 * s23)
-    assert_close(potential, g * sum(x * y for x, y in zip(m, h, strict=True)))
 
 
 @pytest.mark.long

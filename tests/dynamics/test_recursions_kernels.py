@@ -13,7 +13,7 @@ from pinocchio_bridge import as_dtype, assert_close, quick, random_states, rando
 import jaxdyn as jd
 from jaxdyn.dynamics import recursions
 from jaxdyn.dynamics import world_frame as matrix_form
-from jaxdyn.model.joints import KINDS
+from jaxdyn.model.topology import KINDS
 
 pytestmark = pytest.mark.native
 

@@ -272,26 +272,3 @@ def test_gradient_of_a_motion_by_a_length():
     np.testing.assert_allclose(slope, expected, rtol=1e-8)  # 200 steps of RK4
     forward = jax.jit(lambda x: jax.jvp(lambda x: swing(x, "forward")[0], (x,), (1.0,))[1])
     np.testing.assert_allclose(forward(0.7), slope, rtol=1e-11)
-
-
-def test_gradient_of_a_motion_of_a_construction():
-    """Two links: the length moves a joint and an inertia; against differences, through `jd.identify.Construction`."""
-
-    def build(numbers):
-        length = numbers["length"]
-        builder = jd.ModelBuilder("arm")
-        rod = (1.0, length * jnp.array([0.0, 0.0, -0.5]), length**2 * jnp.array([0.09, 0.08, 0.02]))
-        builder.add_body("a", axis=(0, 1, 0), inertia=rod)
-        pose = jnp.eye(4).at[2, 3].set(-length)
-        return builder.add_body("b", "a", pose=pose, axis=(1, 0, 0), inertia=BALL).build()
-
-    def end(length):
-        scene = jd.identify.Construction(build, {"length": length}).scene
-        ts = jnp.array([0.0, 0.5])
-        return jnp.sum(jd.simulate(scene, jnp.array([0.8, -0.4]), jnp.array([0.3, 0.2]), ts, stepsize=0.01).q[-1] ** 2)
-
-    value, slope = jax.jit(jax.value_and_grad(end))(0.9)
-    h, run = 1e-5, jax.jit(end)
-    difference = (run(0.9 + h) - run(0.9 - h)) / (2 * h)
-    assert abs(float(slope)) > 1e-2 * float(value)
-    np.testing.assert_allclose(slope, difference, rtol=1e-7)  # of the differences: h^2 and rounding over h

@@ -391,17 +391,6 @@ def test_rolling_ball_is_not_integrable_and_moves():
 
 
 @pytest.mark.slow
-def test_bar_moves():
-    """Reduced and projected motion agree."""
-    grasp = scenes.hand_with_bar()
-    reduced, projected = simulated(
-        grasp, *scenes.hand_with_bar.start(), [Reduced(grasp.object_velocities), "projected"]
-    )
-    assert_close(reduced.q, projected.q, 1e-9)
-    assert_close(reduced.v, projected.v, 1e-9)
-
-
-@pytest.mark.slow
 def test_batch_of_grasps_with_different_links():
     """One vmap over hands of different lengths equals a loop; also in float32, in its own dtype."""
     lengths = [(0.3, 0.25), (0.28, 0.27), (0.33, 0.22)]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import jaxdyn as jd
 from jaxdyn import inertia, robots
-from jaxdyn.model import host_math, joints
+from jaxdyn.model import host_math, topology
 from tests.pinocchio_bridge import quick, to_pinocchio
 
 BALL = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))
@@ -67,10 +67,10 @@ def test_inertia_fixed_to_the_world_is_dropped_and_its_frame_kept():
     np.testing.assert_array_equal(model.frame_poses[0][:3, 3], [1, 2, 3])
 
 
-@pytest.mark.parametrize("kind", joints.KINDS)
+@pytest.mark.parametrize("kind", topology.KINDS)
 def test_every_kind_has_its_sizes(kind):
     model = built(joint=kind)
-    sizes = joints.KINDS[kind]
+    sizes = topology.KINDS[kind]
     assert (model.nq, model.nv) == (sizes.nq, sizes.nv) == (model.lower.shape[0], model.effort_limit.shape[0])
     assert np.isinf(model.lower).all() and np.isinf(model.effort_limit).all()
     assert model.armature is None and model.damping is None and model.friction is None and model.coupling_values is None
@@ -432,8 +432,8 @@ def test_long_chains_are_built_without_recursion():
 
 def test_random_trees_are_seeded_and_have_every_kind():
     model = robots.random_tree(3, 21, branching=2)
-    assert set(model.topology.kinds) == set(joints.KINDS)
-    for kind in joints.KINDS:
+    assert set(model.topology.kinds) == set(topology.KINDS)
+    for kind in topology.KINDS:
         assert model.topology.kinds.count(kind) == 3
     again, other = robots.random_tree(3, 21, branching=2), robots.random_tree(4, 21, branching=2)
     np.testing.assert_array_equal(model.home, again.home)

@@ -353,18 +353,6 @@ def test_pendulum_in_one_velocity():
     np.testing.assert_allclose(computed.q, want, atol=1e-10)
 
 
-@pytest.mark.slow
-def test_four_bar_in_one_velocity():
-    """A loop of bodies: the motion is that of the projected method, q stays on the constraints to rounding."""
-    scene, state, ts = scenes.four_bar(), scenes.four_bar.start(rate=3.0), np.linspace(0.0, 1.0, 4)
-    want = moved(scene, state, ts)
-    computed = moved(scene, state, ts, method="reduced")
-    assert bool(computed.success)
-    assert float(computed.constraint_residual.max()) < 1e-12
-    np.testing.assert_allclose(computed.q, want.q, atol=1e-10)
-    np.testing.assert_allclose(computed.v, want.v, atol=1e-10)
-
-
 @pytest.mark.native
 @pytest.mark.parametrize("name", ["four_bar", "rolling_disk"])
 def test_motions_are_one_native_loop(name, monkeypatch):

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
-from scipy.integrate import solve_ivp
 
 import jaxdyn as jd
 from benchmarks.report_cases import test_set
@@ -146,69 +145,6 @@ def test_ring_of_bars():
     np.testing.assert_allclose(moment.sum() + length**2 / 12 * turning[0].sum(), 0, atol=1e-12)
 
 
-class Bennett:
-    """Bennett's linkage as one equation for the first angle, from the energies of rods with moving ends."""
-
-    def __init__(self, lengths=(1.0, 0.7), twist=1.1, mass=1.0, gravity=9.81):
-        self.mass, self.gravity = mass, gravity
-        other = np.arcsin(lengths[1] * np.sin(twist) / lengths[0])
-        self.ratio = np.sin((other + twist) / 2) / np.sin((other - twist) / 2)
-        self.links = [(lengths[0], twist), (lengths[1], other)]
-
-    def angles(self, q):
-        return q, 2 * np.arctan(self.ratio / np.tan(q / 2)), -q
-
-    def ends(self, q):
-        """Joints 1 to 4 (4, 3); complex steps may pass."""
-        pose, places = np.eye(4, dtype=np.result_type(q, float)), [np.zeros(3)]
-        for angle, (length, twist) in zip(self.angles(q), [*self.links, self.links[0]], strict=True):
-            c, s, ct, st = np.cos(angle), np.sin(angle), np.cos(twist), np.sin(twist)
-            turn = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-            pose = pose @ turn @ np.array([[1, 0, 0, length], [0, ct, -st, 0], [0, st, ct, 0], [0, 0, 0, 1]])
-            places.append(pose[:3, 3])
-        return np.stack(places)
-
-    def inertia(self, q):
-        """I(q) in T = I q'^2/2: rods with ends moving at u and w hold m (u.u + u.w + w.w)/6."""
-        u = self.ends(q + 1e-30j).imag / 1e-30
-        pairs = np.sum(u[:-1] ** 2 + u[:-1] * u[1:] + u[1:] ** 2)
-        return self.mass / 3 * pairs
-
-    def potential(self, q):
-        heights = self.ends(q)[:, 2]
-        return self.mass * self.gravity / 2 * np.sum(heights[:-1] + heights[1:])
-
-    def acceleration(self, q, rate, h=1e-3):
-        """From I q'' + I' q'^2/2 + V' = 0; the slopes by differences of eighth order."""
-        slope = lambda f: sum(  # noqa: E731
-            w * (f(q + k * h) - f(q - k * h)) / h for k, w in ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
-        )
-        return -(slope(self.inertia) * rate**2 / 2 + slope(self.potential)) / self.inertia(q)
-
-
-def test_bennett_linkage():
-    """Five rows of rank two: one freedom that counting does not find, with the right acceleration."""
-    scene, oracle = scenes.bennett(), Bennett()
-    solve = quick(jax.vmap(lambda q, v: (residuals(scene, q, v), jd.constrained_dynamics(scene, q, v))))
-    cases = [(0.8, 1.0), (2.5, -0.7), (-1.2, 2.0)]
-    starts = [scenes.bennett.start(angle=angle, rate=rate) for angle, rate in cases]
-    error, computed = solve(*(jnp.stack(x) for x in zip(*starts, strict=True)))
-    assert float(error.max()) < 1e-14
-    assert (np.asarray(computed.rank) == 2).all() and computed.multipliers.shape == (3, 5)
-    assert bool((computed.result == jd.RESULTS.successful).all())
-    for (angle, rate), a in zip(cases, np.asarray(computed.acceleration), strict=True):
-        first = oracle.acceleration(angle, rate)
-        follower = oracle.angles(angle)[1]
-        # q2' = -q1' sin q2/sin q1, differentiated.
-        ratio = np.sin(follower) / np.sin(angle)
-        second = -first * ratio - rate * (np.cos(follower) * -rate * ratio - ratio * np.cos(angle) * rate) / np.sin(
-            angle
-        )
-        assert_close(a, [first, second, -first], 1e-10)
-    with pytest.raises(ValueError, match=r"make no Bennett linkage; sin\(beta\) is 1.7"):
-        scenes.bennett(lengths=(1.0, 2.0))
-
-
 @pytest.mark.long
 def test_andrews_from_its_bodies():
     """The tree of seven bodies and the printed M and f: equal accelerations and energies on the constraints."""
@@ -271,40 +207,6 @@ def test_spherical_pendulum_three_ways():
     place = np.stack([sine * np.cos(chart[:, 1]), sine * np.sin(chart[:, 1]), -np.cos(chart[:, 0])], 1)
     np.testing.assert_allclose(projected, radius * place, atol=1e-10)
     np.testing.assert_allclose(form, projected, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_motion_of_the_bennett_linkage():
-    """Turned by gravity, against the one equation; the five dependent rows stay closed.
-
-    The rows depend on each other only where the loop is closed. Within a step it is open by the errors of the stages,
-    so the rank tolerance has to lie above these: with the default, the third singular value would count.
-    """
-    oracle, ts = Bennett(), np.linspace(0.0, 3.0, 7)
-    want = solve_ivp(
-        lambda t, y: [y[1], oracle.acceleration(*y)],
-        (0.0, 3.0),
-        [0.8, 1.0],
-        method="DOP853",
-        rtol=1e-12,
-        atol=1e-12,
-        t_eval=ts,
-    ).y
-    q0, v0 = scenes.bennett.start(angle=0.8, rate=1.0)
-    motion = jd.simulate(
-        scenes.bennett(),
-        q0,
-        v0,
-        ts,
-        method=jd.Projected(rank_tol=1e-4),
-        stepsize=0.002,
-        outputs=("constraint_residual",),
-    )
-    assert float(motion.constraint_residual.max()) <= 1e-13
-    q, v = motion.q[1:], motion.v[1:]
-    np.testing.assert_allclose(q[:, 0], want[0, 1:], atol=1e-9)  # h^4, and the differences in the equation
-    np.testing.assert_allclose(v[:, 0], want[1, 1:], atol=1e-9)
-    np.testing.assert_allclose(q[:, 2], -q[:, 0], atol=1e-12)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.model.joints import SCREW_KINDS
+from jaxdyn.model.topology import SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology, geometry
 
 # Common normals of nearly parallel lines are far away: lengths grow by 1/sin(alpha), and with their
@@ -74,7 +74,8 @@ def canonical_frames(model: Model) -> Frames:
     # Always in float64: the decomposition divides by sines.
     wide = home.astype(float)
     placement = _denavit_hartenberg(model.topology, wide, placement.astype(float), eps)
-    homes = _relative_homes(model.topology, wide, placement)
+    outer = [placement[parent] if parent >= 0 else np.eye(4) for parent in model.topology.parents]
+    homes = np.array([_inverse(a) @ h @ b for a, h, b in zip(outer, wide, placement, strict=True)]).reshape(-1, 4, 4)
     decomposed = [_decompose(pose, eps) for pose in homes]
     rate = np.where(np.abs(rate - 1) <= eps, np.ones_like(rate), rate)
     return Frames(placement.astype(home.dtype), homes.astype(home.dtype), decomposed, rate, pitch)
@@ -114,12 +115,6 @@ def _inverse(pose, xp=np):
     """Inverse of poses (..., 4, 4)."""
     turned = xp.swapaxes(pose[..., :3, :3], -1, -2)
     return xp.concatenate([xp.concatenate([turned, -turned @ pose[..., :3, 3:]], -1), pose[..., 3:, :]], -2)
-
-
-def _relative_homes(topology: Topology, home, placement):
-    """Home poses between canonical frames."""
-    outer = [placement[parent] if parent >= 0 else np.eye(4) for parent in topology.parents]
-    return np.array([_inverse(a) @ h @ b for a, h, b in zip(outer, home, placement, strict=True)]).reshape(-1, 4, 4)
 
 
 def _denavit_hartenberg(topology: Topology, home, placement, eps):

@@ -28,7 +28,7 @@ from jaxdyn.dynamics.recursions.transforms import (
     outer,
     part,
 )
-from jaxdyn.model.joints import KINDS, SCREW_KINDS
+from jaxdyn.model.topology import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model
 
 TURN_ABOUT_Z = ("revolute", "continuous", "helical", "planar")

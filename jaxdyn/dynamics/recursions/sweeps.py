@@ -36,7 +36,7 @@ from jaxdyn.dynamics.recursions.transforms import (
     twist_to_child,
     wrench_to_parent,
 )
-from jaxdyn.model.joints import SCREW_KINDS, screw_transform
+from jaxdyn.model.topology import SCREW_KINDS, screw_transform
 from jaxdyn.model.tree import Model, nearest_rotation
 
 _TURNS = ("revolute", "continuous")
@@ -220,13 +220,6 @@ def _split(bodies: _Bodies, *values) -> list[tuple]:
     return [(None, None) if x is None else (part(x, 0, 6), part(x, 6, x.shape[0])) for x in values]
 
 
-def _base_chain(bodies: _Bodies, q) -> Chain:
-    """Pose of the floating base."""
-    return compose(
-        bodies.home(bodies.base), Transform(part(q, 0, 3), GeneralRotation(quaternion_rotation(part(q, 3, 7))))
-    )
-
-
 def _eliminate_base(bodies: _Bodies, A) -> tuple[list, list]:
     """Gains and inverse pivots of the six degrees of freedom of the base, of the articulated inertia A."""
     gains, inverses, armature = [], [], bodies.base.armature
@@ -260,7 +253,8 @@ def _wrenches(bodies: _Bodies, q, v, a) -> tuple[Any, Any, Any]:
     (of_base, v), (rate, a), own = *_split(bodies, v, a), None
     if bodies.first:
         S = np.eye(6, dtype=bodies.dtype)
-        start = move_with_joint(start, _base_chain(bodies, q), S, of_base, rate)
+        pose = Transform(part(q, 0, 3), GeneralRotation(quaternion_rotation(part(q, 3, 7))))
+        start = move_with_joint(start, compose(bodies.home(bodies.base), pose), S, of_base, rate)
         own = wrench_of_acceleration(start[2], start[3], bodies.moments(bodies.base))
         q = part(q, 7, q.shape[0])
 

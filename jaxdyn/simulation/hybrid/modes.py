@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Rows, layout, position_residual, rows
+from jaxdyn.constraints.redundancy import add_constraints
 from jaxdyn.contact.unilateral import UnilateralContact, WithModes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import Pieces
@@ -128,12 +129,9 @@ def normal_load(scene: Scene, element: Element, q, v, t) -> Array:
 
 def extend(scene: Scene) -> Scene:
     """Scene with the rows of its elements behind its own, and without these forces."""
-    return Scene(
-        scene.system,
-        # Behind the scene's own rows, whose indices stay as they are: outputs take the first `own` multipliers.
-        (*scene.constraints, *(_constraint(force) for force in scene.forces if isinstance(force, WithModes))),
-        tuple(force for force in scene.forces if not isinstance(force, WithModes)),
-    )
+    # Behind the scene's own rows, whose indices stay as they are: outputs take the first `own` multipliers.
+    more = [_constraint(force) for force in scene.forces if isinstance(force, WithModes)]
+    return add_constraints(scene, more, [force for force in scene.forces if not isinstance(force, WithModes)])
 
 
 def _constraint(force: Any):

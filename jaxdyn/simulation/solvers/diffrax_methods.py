@@ -22,7 +22,7 @@ from jaxdyn.lie import se2, se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.configuration import map_joints
-from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
+from jaxdyn.model.topology import SCREW_KINDS, joint_integrate, joint_rate
 from jaxdyn.model.tree import Model, Topology
 from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StageInterpolation, StepOutput, Wrapped
 from jaxdyn.systems.system import has_dependent_coordinates
