@@ -8,16 +8,17 @@ import jax
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def run(page: str, section: str = "", least: int = 3, head: bool = False) -> dict:
+def run(page: str, section: str = "", head: bool = False) -> dict:
     """All blocks of a page or section in one namespace, as a reader pastes them one after another; the names they leave.
 
     With `head` the blocks above the page's first section come first.
     """
     text = (ROOT / page).read_text()
-    first = re.split(r"\n## ", text)[0] if head else ""
-    text = first + re.split(r"\n## ", text.partition(f"## {section}\n")[2])[0] if section else text
+    before, heading, rest = text.partition(f"\n## {section}\n")
+    assert heading or not section, f"{page} has no section {section}"
+    text = (re.split(r"\n## ", before)[0] if head else "") + re.split(r"\n## ", rest)[0] if section else text
     blocks = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
-    assert len(blocks) >= least
+    assert blocks, f"{page} has no examples"
     names: dict = {}
     # A reader has jax's own settings, not the strict ones of the tests.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):

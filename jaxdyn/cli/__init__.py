@@ -10,7 +10,7 @@ import jax
 
 from jaxdyn import __version__
 from jaxdyn.cli import calibrate, excite, export, identify, info, report, simulate, sweep
-from jaxdyn.cli.common import help_format
+from jaxdyn.cli.common import help_format, option
 
 COMMANDS = (info, simulate, sweep, excite, identify, calibrate, report, export)
 _EPILOG = """\
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             formatter_class=help_format,
         )
         module.add_arguments(command)
-        command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        option(command, "--debug", "show the traceback of an error")
         # argparse then selects the function together with the command.
         command.set_defaults(run=module.run)
     try:

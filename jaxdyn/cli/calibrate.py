@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import identify
-from jaxdyn.cli.common import add_model_options, load_model, output_path, real, table, whole
+from jaxdyn.cli.common import add_model_options, load_model, option, output_path, real, table, whole
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify.geometry_errors import PARTS
 from jaxdyn.io import save_urdf
@@ -43,23 +43,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("urdf", help="the robot, where the fit starts")
     add_model_options(parser)
-    parser.add_argument("--frame", required=True, help="the link or frame that is measured")
-    parser.add_argument("--poses", metavar="FILE", help="measured poses, .csv")
-    parser.add_argument("--choose", type=whole, metavar="N", help="choose N configurations to measure instead")
-    parser.add_argument("--marker", action="store_true", help="with --choose: positions alone will be measured")
-    parser.add_argument(
-        "--free",
-        nargs="+",
-        choices=PARTS,
-        default=PARTS,
-        metavar="PART",
-        help=f"some of {', '.join(PARTS)} (default: all)",
-    )
-    parser.add_argument("--test", type=real, default=0.0, metavar="SHARE", help="share of the poses to hold out")
-    parser.add_argument("--seed", type=whole, default=0, help="seed of the configurations to choose from (default: 0)")
-    parser.add_argument(
-        "--out", metavar="FILE", help="write the calibrated robot, .urdf; with --choose the poses, .csv"
-    )
+    option(parser, "--frame FRAME", "the link or frame that is measured", required=True)
+    option(parser, "--poses FILE", "measured poses, .csv")
+    option(parser, "--choose N", "choose N configurations to measure instead", whole)
+    option(parser, "--marker", "with --choose: positions alone will be measured")
+    option(parser, "--free PART ...", f"some of {', '.join(PARTS)} (default: all)", default=PARTS, choices=PARTS)
+    option(parser, "--test SHARE", "share of the poses to hold out", real, 0.0)
+    option(parser, "--seed SEED", "seed of the configurations to choose from (default: 0)", whole, 0)
+    option(parser, "--out FILE", "write the calibrated robot, .urdf; with --choose the poses, .csv")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -157,14 +148,7 @@ def read_poses(path: str, joints) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(
             f"{file}, line {row + 2}: the quaternion has length {length[row]:.4g}; give unit ones, qw first"
         )
-    rotations = [_rotation(x) for x in quaternions / length[:, None]]
-    return q, np.stack([np.asarray(host_math.pose_of(R, p)) for R, p in zip(rotations, position, strict=True)])
-
-
-def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation 1 + 2 w hat(u) + 2 hat(u)^2 of a unit quaternion (w, u)."""
-    cross = host_math.hat(quaternion[1:])
-    return np.eye(3) + 2 * quaternion[0] * cross + 2 * cross @ cross
+    return q, np.stack([host_math.joint_pose("free", np.zeros(6), x) for x in np.hstack([position, quaternions])])
 
 
 def _is_number(text: str) -> bool:

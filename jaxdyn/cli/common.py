@@ -5,12 +5,13 @@ import contextlib
 import os
 import pathlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
+from jaxdyn.constraints.loops import Loop
 from jaxdyn.io import LoadedScene, formats, urdf_inertia_report
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import inertia
@@ -33,41 +34,57 @@ def help_format(prog: str) -> argparse.HelpFormatter:
     return argparse.RawDescriptionHelpFormatter(prog, max_help_position=29)
 
 
+def option(
+    place: argparse._ActionsContainer,
+    usage: str,
+    text: str,
+    kind: Callable[[str], float] | None = None,
+    default: object = None,
+    **more: Any,
+) -> None:
+    """Add an option to a parser or a group by its usage, as help prints it, and a text.
+
+    "--view" is a flag, "--dt S" has a value, "--q0 Q ..." several, "--gravity X Y Z" three, "--abi {c,casadi}" one of these.
+    """
+    name, *values = usage.split()
+    if not values:
+        place.add_argument(name, action="store_true", help=text)
+        return
+    if values[0].startswith("{"):
+        more["choices"] = values[0].strip("{}").split(",")
+    elif values[-1] == "...":
+        more |= {"nargs": "+", "metavar": values[0]}
+    else:
+        more |= {"nargs": len(values), "metavar": tuple(values)} if len(values) > 1 else {"metavar": values[0]}
+    if more.get("action") == "extend":
+        # Shells expand one pattern per option, so that a repeated option extends its list.
+        default = []
+    place.add_argument(name, help=text, type=kind or str, default=default, **more)
+
+
 def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> None:
     """Add the options that determine the mechanism of a file."""
     group = parser.add_argument_group(title)
-    group.add_argument(
-        "--floating-base", action="store_true", help="let the root link move freely (6 more degrees of freedom)"
-    )
+    option(group, "--floating-base", "let the root link move freely (6 more degrees of freedom)")
     # SDF models float by default and URDF models do not, so each direction has an option.
-    group.add_argument("--fixed-base", action="store_true", help="fix the root links of an SDF file to the world")
-    group.add_argument(
-        "--lock",
-        nargs="+",
+    option(group, "--fixed-base", "fix the root links of an SDF file to the world")
+    option(
+        group,
+        "--lock JOINT[=VALUE] ...",
+        "lock these joints of a URDF file, at neutral or at a value (rad, m)",
         action="extend",
-        default=[],
-        metavar="JOINT[=VALUE]",
-        help="lock these joints of a URDF file, at neutral or at a value (rad, m)",
     )
-    group.add_argument(
-        "--mimic",
-        choices=("couple", "ignore"),
-        help="joints of a URDF file that follow others: coupled (info and simulate: the default), or free",
+    option(
+        group,
+        "--mimic {couple,ignore}",
+        "joints of a URDF file that follow others: coupled (info and simulate: the default), or free",
     )
-    group.add_argument(
-        "--arguments",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME=VALUE",
-        help="arguments of a .xacro file, which is expanded first",
-    )
-    group.add_argument(
-        "--gravity",
-        nargs=3,
-        type=real,
-        metavar=("X", "Y", "Z"),
-        help="gravity, m/s^2 (default: that of the file; for URDF 0 0 -9.81 in axes of the root link)",
+    option(group, "--arguments NAME=VALUE ...", "arguments of a .xacro file, which is expanded first", action="extend")
+    option(
+        group,
+        "--gravity X Y Z",
+        "gravity, m/s^2 (default: that of the file; for URDF 0 0 -9.81 in axes of the root link)",
+        real,
     )
 
 
@@ -123,6 +140,12 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     if args.gravity is not None:
         scene = eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity)))
     return scene, file
+
+
+def load_mechanism(path: str, args) -> LoadedScene | None:
+    """Scene of a file that has loops; None for a tree."""
+    scene, _ = load_scene(path, args)
+    return scene if any(isinstance(constraint, Loop) for constraint in scene.constraints) else None
 
 
 def _lock(args: argparse.Namespace) -> dict[str, Any]:
@@ -276,13 +299,11 @@ class Stopwatch:
 # --- options `--client` and `--workers`: Dask clusters that compute for a command ---
 
 
-def add_cluster_options(parser: "argparse.ArgumentParser | argparse._ArgumentGroup") -> None:
+def add_cluster_options(parser: argparse._ActionsContainer) -> None:
     """Add the options to a parser or to a group of one."""
     place = parser.add_mutually_exclusive_group()
-    place.add_argument(
-        "--client", metavar="ADDRESS", help="address of a Dask scheduler whose workers compute, as tcp://host:8786"
-    )
-    place.add_argument("--workers", type=whole, metavar="N", help="number of local Dask worker processes to start")
+    option(place, "--client ADDRESS", "address of a Dask scheduler whose workers compute, as tcp://host:8786")
+    option(place, "--workers N", "number of local Dask worker processes to start", whole)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,9 @@ from jaxdyn.cli.common import (
     add_model_options,
     check_least,
     check_memory,
+    load_mechanism,
     load_model,
+    option,
     output_path,
     per_coordinate,
     plot_motion,
@@ -18,7 +20,6 @@ from jaxdyn.cli.common import (
     table,
     whole,
 )
-from jaxdyn.cli.identify_mechanism import load_mechanism
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import TERMS
 from jaxdyn.identify.excitation_search import OBJECTIVES
@@ -48,35 +49,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("urdf", help="the robot; its limits of position, velocity and effort are respected")
     add_model_options(parser)
-    parser.add_argument(
-        "--motors",
-        nargs="+",
-        metavar="JOINT",
-        help="driven joints of a robot with loops, as many as degrees of freedom",
-    )
-    parser.add_argument("--out", metavar="FILE", help="write the motion, .csv or .npz")
-    parser.add_argument("--plot", metavar="FILE", help="plot the motion to FILE.png, .pdf or .svg")
-    parser.add_argument("--period", type=real, default=10.0, metavar="S", help="period of the motion, s (default: 10)")
-    parser.add_argument("--periods", type=whole, default=1, metavar="N", help="number of periods to write (default: 1)")
-    parser.add_argument("--harmonics", type=whole, default=5, metavar="N", help="harmonics of the series (default: 5)")
-    parser.add_argument("--rate", type=real, default=100.0, metavar="HZ", help="samples per second (default: 100)")
+    option(parser, "--motors JOINT ...", "driven joints of a robot with loops, as many as degrees of freedom")
+    option(parser, "--out FILE", "write the motion, .csv or .npz")
+    option(parser, "--plot FILE", "plot the motion to FILE.png, .pdf or .svg")
+    option(parser, "--period S", "period of the motion, s (default: 10)", real, 10.0)
+    option(parser, "--periods N", "number of periods to write (default: 1)", whole, 1)
+    option(parser, "--harmonics N", "harmonics of the series (default: 5)", whole, 5)
+    option(parser, "--rate HZ", "samples per second (default: 100)", real, 100.0)
     parser.add_argument(
         "--terms", nargs="*", choices=TERMS, default=TERMS, help="terms to identify in addition to the bodies"
     )
     parser.add_argument(
         "--objective", choices=OBJECTIVES, default="logdet", help="measure of excitation (default: logdet)"
     )
-    parser.add_argument("--margin", type=real, default=0.9, help="fraction of all limits to use (default: 0.9)")
-    parser.add_argument(
-        "--velocity", nargs="+", type=real, metavar="V", help="velocity limits instead of the file's, rad/s, m/s"
-    )
-    parser.add_argument(
-        "--torque", nargs="+", type=real, metavar="T", help="torque limits instead of the file's, N m, N"
-    )
-    parser.add_argument("--seed", type=whole, default=0, help="seed of the random initial motions (default: 0)")
-    parser.add_argument(
-        "--steps", type=whole, default=300, metavar="N", help="steps of the optimisation (default: 300)"
-    )
+    option(parser, "--margin MARGIN", "fraction of all limits to use (default: 0.9)", real, 0.9)
+    option(parser, "--velocity V ...", "velocity limits instead of the file's, rad/s, m/s", real)
+    option(parser, "--torque T ...", "torque limits instead of the file's, N m, N", real)
+    option(parser, "--seed SEED", "seed of the random initial motions (default: 0)", whole, 0)
+    option(parser, "--steps N", "steps of the optimisation (default: 300)", whole, 300)
 
 
 def run(args: argparse.Namespace) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 import jaxdyn as jd
-from jaxdyn.cli.common import FILE, add_model_options, load_scene
+from jaxdyn.cli.common import FILE, add_model_options, load_scene, option
 from jaxdyn.exports.exported import ABIS, HOST, TARGETS
 
 HELP = "write a function of a robot as an object file for C or CasADi"
@@ -46,19 +46,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="forward_dynamics",
         help="function to export (default: forward_dynamics)",
     )
-    parser.add_argument("--name", help="name of the C function (default: that of --function)")
-    parser.add_argument(
-        "--jacobian", action="store_true", help="add the Jacobians of the result with respect to each argument"
-    )
-    parser.add_argument("--batch", action="store_true", help="add a vectorised function of many samples")
-    parser.add_argument("--out", metavar="FOLDER", required=True, help="output folder, created if missing")
-    parser.add_argument(
-        "--target",
+    option(parser, "--name NAME", "name of the C function (default: that of --function)")
+    option(parser, "--jacobian", "add the Jacobians of the result with respect to each argument")
+    option(parser, "--batch", "add a vectorised function of many samples")
+    option(parser, "--out FOLDER", "output folder, created if missing", required=True)
+    option(
+        parser,
+        "--target TARGET",
+        f"target platform: {HOST}, {', '.join(TARGETS)}, or an LLVM triple (default: {HOST})",
         default=HOST,
-        help=f"target platform: {HOST}, {', '.join(TARGETS)}, or an LLVM triple (default: {HOST})",
     )
-    parser.add_argument("--cpu", help="processor in LLVM's notation, such as cortex-a72")
-    parser.add_argument("--features", help="processor features in LLVM's notation, such as +neon")
+    option(parser, "--cpu CPU", "processor in LLVM's notation, such as cortex-a72")
+    option(parser, "--features FEATURES", "processor features in LLVM's notation, such as +neon")
     parser.add_argument("--abi", choices=ABIS, default="c", help="calling interface (default: c)")
 
 
@@ -69,8 +68,19 @@ def run(args: argparse.Namespace) -> None:
     names, example = _ARGUMENTS[args.function], np.asarray(jd.neutral(scene.system), float)
     rest = np.zeros(scene.system.nv)
     name = args.function if args.name is None else args.name
+    system, function = scene.system, getattr(jd, args.function)
+    # The C header takes its argument names from the signature, so `*args` would not do.
+    wrappers: dict[tuple[str, ...], Callable] = {
+        ("q", "v", "tau"): lambda q, v, tau: function(system, q, v, tau),
+        ("q", "v", "a"): lambda q, v, a: function(system, q, v, a),
+        ("q", "v"): lambda q, v: function(system, q, v),
+        ("q",): lambda q: function(system, q),
+    }
+    if args.function == "constrained_dynamics":
+        # An exported function returns one array; the result of the library holds more.
+        wrappers[names] = lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration
     exported = jd.export(
-        _function_of(scene, args.function),
+        wrappers[names],
         *(example if x == "q" else rest for x in names),
         name=name,
         derivatives=("jacobian",) if args.jacobian else (),
@@ -80,20 +90,3 @@ def run(args: argparse.Namespace) -> None:
     # The folder may hold exports of other names.
     files = ", ".join(sorted(x.name for x in folder.iterdir() if x.name.startswith(name)))
     print(f"{exported} for {args.target}, in {folder}: {files}")
-
-
-def _function_of(scene, name: str) -> Callable:
-    """Function of arrays only, with the parameter names of the C header."""
-    system = scene.system
-    if name == "constrained_dynamics":
-        # An exported function returns one array; the result of the library holds more.
-        return lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration
-    function = getattr(jd, name)
-    # The C header takes its argument names from the signature, so `*args` would not do.
-    wrappers: dict[tuple[str, ...], Callable] = {
-        ("q", "v", "tau"): lambda q, v, tau: function(system, q, v, tau),
-        ("q", "v", "a"): lambda q, v, a: function(system, q, v, a),
-        ("q", "v"): lambda q, v: function(system, q, v),
-        ("q",): lambda q: function(system, q),
-    }
-    return wrappers[_ARGUMENTS[name]]

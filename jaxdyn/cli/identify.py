@@ -15,12 +15,13 @@ from jaxdyn.cli.common import (
     check_least,
     connect,
     load_for_repair,
+    load_mechanism,
     load_model,
+    option,
     output_path,
     real,
     whole,
 )
-from jaxdyn.cli.identify_mechanism import load_mechanism, run_mechanism
 from jaxdyn.cli.identify_options import (
     filter_log,
     find_gains,
@@ -32,14 +33,16 @@ from jaxdyn.cli.identify_options import (
     raw_log,
     resolve_options,
 )
-from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
+from jaxdyn.cli.identify_tables import error_table, gains_text, mechanism_text, payload_text, tables
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
+from jaxdyn.identify.applied_fits import fit_mechanism
 from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.linear_fit import base_terms
 from jaxdyn.identify.raw_logs import check_log_content, check_rest, vibration
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.io import save_urdf
+from jaxdyn.io.loaded import LoadedScene
 from jaxdyn.io.urdf_write import write_text
 from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model, inertia_report, repair_inertias
@@ -77,43 +80,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command: those of daily use first, the rest as "advanced"."""
     # The generated usage would list all options, and a user needs two of them.
     parser.usage = "%(prog)s --urdf ROBOT.urdf --log FILE ... [options]"
-    # A repeated option extends its list: shells expand one pattern per option.
-    several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
-    parser.add_argument("--urdf", metavar="FILE", help="robot; its geometry is fixed, its inertias are the prior")
-    parser.add_argument("--log", **several, metavar="FILE", help="training logs, .csv or .npz")
-    parser.add_argument("--test-log", **several, metavar="FILE", help="test logs (default: the end of every log)")
-    parser.add_argument("--out", metavar="FILE", help="write the fitted robot, .urdf; also the report")
-    parser.add_argument("--report", metavar="FILE", help="write parameters and errors, .json (default: next to --out)")
-    parser.add_argument("--html", metavar="FILE", help="write a page with tables and plots, .html")
-    parser.add_argument("--progress", action="store_true", help="print trials and the loss while fitting")
-    _add_expert_options(
-        parser.add_argument_group("advanced: data"), parser.add_argument_group("advanced: fit"), several
-    )
-    add_model_options(parser, "advanced: model")
-
-
-def _add_expert_options(data, fit, several: dict[str, Any]) -> None:
-    data.add_argument("--payload-log", **several, metavar="FILE", help="logs of the same robot with a payload")
-    data.add_argument("--payload-body", metavar="LINK", help="link with the payload (default: the last)")
-    data.add_argument("--payload-mass", type=real, metavar="KG", help="known payload mass: also fit drive gains")
-    data.add_argument(
-        "--payload-centre", nargs=3, type=real, metavar=("X", "Y", "Z"), help="known centre of mass in LINK, m"
-    )
-    data.add_argument("--rename", **several, metavar="NAME=JOINT", help="names of joints in the logs")
-    data.add_argument("--train", type=real, default=0.7, metavar="SHARE", help="training share (default: 0.7)")
-    data.add_argument("--cutoff", default="auto", metavar="HZ", help="low-pass frequency (default: auto, by spectra)")
-    data.add_argument(
-        "--every", type=whole, metavar="N", help="keep one of N samples (default: 15 per period of --cutoff)"
-    )
-    data.add_argument("--trim", type=whole, metavar="N", help="samples to drop at each end (default: 38 * --every)")
-    data.add_argument("--filtered", action="store_true", help="the logs are filtered already")
-    data.add_argument(
-        "--unwrap", choices=("auto", "yes", "no"), default="auto", help="angles that jump by turns (default: auto)"
-    )
-    data.add_argument(
-        "--outliers", choices=("refuse", "drop", "keep"), default="refuse", help="corrupted samples (default: refuse)"
-    )
-    fit.add_argument("--method", choices=METHODS, metavar="M", default="feasible", help=f"{', '.join(METHODS)}")
+    option(parser, "--urdf FILE", "robot; its geometry is fixed, its inertias are the prior")
+    option(parser, "--log FILE ...", "training logs, .csv or .npz", action="extend")
+    option(parser, "--test-log FILE ...", "test logs (default: the end of every log)", action="extend")
+    option(parser, "--out FILE", "write the fitted robot, .urdf; also the report")
+    option(parser, "--report FILE", "write parameters and errors, .json (default: next to --out)")
+    option(parser, "--html FILE", "write a page with tables and plots, .html")
+    option(parser, "--progress", "print trials and the loss while fitting")
+    data, fit = (parser.add_argument_group(f"advanced: {part}") for part in ("data", "fit"))
+    option(data, "--payload-log FILE ...", "logs of the same robot with a payload", action="extend")
+    option(data, "--payload-body LINK", "link with the payload (default: the last)")
+    option(data, "--payload-mass KG", "known payload mass: also fit drive gains", real)
+    option(data, "--payload-centre X Y Z", "known centre of mass in LINK, m", real)
+    option(data, "--rename NAME=JOINT ...", "names of joints in the logs", action="extend")
+    option(data, "--train SHARE", "training share (default: 0.7)", real, 0.7)
+    option(data, "--cutoff HZ", "low-pass frequency (default: auto, by spectra)", default="auto")
+    option(data, "--every N", "keep one of N samples (default: 15 per period of --cutoff)", whole)
+    option(data, "--trim N", "samples to drop at each end (default: 38 * --every)", whole)
+    option(data, "--filtered", "the logs are filtered already")
+    option(data, "--unwrap {auto,yes,no}", "angles that jump by turns (default: auto)", default="auto")
+    option(data, "--outliers {refuse,drop,keep}", "corrupted samples (default: refuse)", default="refuse")
+    option(fit, "--method M", f"{', '.join(METHODS)}", default="feasible", choices=METHODS)
     fit.add_argument(
         "--terms",
         nargs="*",
@@ -121,19 +108,16 @@ def _add_expert_options(data, fit, several: dict[str, Any]) -> None:
         metavar="TERM",
         help=f"auto, {', '.join((*TERMS, *EXTRA))}",
     )
-    fit.add_argument("--v-s", default="auto", metavar="V", help="smoothing of Coulomb friction, rad/s (default: auto)")
-    fit.add_argument("--prior", default="auto", metavar="W", help="weight of the prior (default: auto)")
-    fit.add_argument(
-        "--weights", choices=("auto", "none"), default="auto", help="of joints: auto, by residuals (default); none"
-    )
-    fit.add_argument("--robust", default="auto", metavar="K", help="Huber threshold, or none (default: auto)")
-    fit.add_argument(
-        "--delay", nargs="+", default=["none"], metavar="S", help="torque delay: seconds, auto, none (default: none)"
-    )
-    fit.add_argument("--horizon", type=real, default=0.25, metavar="S", help="of trajectory segments (default: 0.25)")
-    fit.add_argument("--steps", type=whole, default=100, metavar="N", help="of the trajectory fit (default: 100)")
+    option(fit, "--v-s V", "smoothing of Coulomb friction, rad/s (default: auto)", default="auto")
+    option(fit, "--prior W", "weight of the prior (default: auto)", default="auto")
+    option(fit, "--weights {auto,none}", "of joints: auto, by residuals (default); none", default="auto")
+    option(fit, "--robust K", "Huber threshold, or none (default: auto)", default="auto")
+    option(fit, "--delay S ...", "torque delay: seconds, auto, none (default: none)", default=["none"])
+    option(fit, "--horizon S", "of trajectory segments (default: 0.25)", real, 0.25)
+    option(fit, "--steps N", "of the trajectory fit (default: 100)", whole, 100)
     add_cluster_options(fit)
-    fit.add_argument("--repair", action="store_true", help="replace unphysical and missing inertias first")
+    option(fit, "--repair", "replace unphysical and missing inertias first")
+    add_model_options(parser, "advanced: model")
 
 
 @on_one_thread
@@ -222,7 +206,7 @@ def run(args: argparse.Namespace) -> None:
         tests=_evaluate(model, judge, test_names, tests),
         train=_evaluate(model, judge, names[: len(logs)], trained),
         final=_evaluate(model, final, names[: len(logs)], logs),
-        outcome=_outcome(final),
+        outcome=_outcome(fit),
         is_refit=not test_paths,
         warnings=[],
         identifiability=identify.identifiability(model, logs, base_terms(fit.terms), v_s=v_s),
@@ -238,8 +222,8 @@ def run(args: argparse.Namespace) -> None:
     lines += [*(f"warning: {line}" for line in findings.warnings), tables(findings)]
     text = "\n".join(lines)
     print(text)
-    if out is not None and not isinstance(final, LeastSquares):
-        save_urdf((final.fit if isinstance(final, RobotFit) else final).model, out, torques=_extra_torques(final))
+    if out is not None and not isinstance(fit, LeastSquares):
+        save_urdf(fit.model, out, torques=_extra_torques(fit))
         print(f"Wrote {out}.")
     payload = None
     if isinstance(final, RobotFit) and args.payload_log:
@@ -260,9 +244,8 @@ def run(args: argparse.Namespace) -> None:
         print(f"Wrote {html}.")
 
 
-def _extra_torques(result: RobotFit | Fit) -> dict[str, dict[str, float]]:
+def _extra_torques(fit: Fit) -> dict[str, dict[str, float]]:
     """Torque parameters that URDF lacks, of joints with one coordinate: offsets, smoothing velocity, extra terms."""
-    fit = result.fit if isinstance(result, RobotFit) else result
     model = fit.model
     named: dict[str, Any] = {"offset": fit.friction.offset, "v_s": np.full(model.nv, float(fit.friction.v_s))}
     if fit.extra is not None:
@@ -293,10 +276,9 @@ def _settings(args, cutoff: float | None) -> dict[str, Any]:
     }
 
 
-def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
-    if isinstance(result, LeastSquares):
-        return f"{len(result.values)} base parameters, {result.rank} excited, condition {result.condition:.4g}"
-    fit = result.fit if isinstance(result, RobotFit) else result
+def _outcome(fit: Fit | LeastSquares) -> str:
+    if isinstance(fit, LeastSquares):
+        return f"{len(fit.values)} base parameters, {fit.rank} excited, condition {fit.condition:.4g}"
     return f"{name_of(fit.result).replace('_', ' ')} after {len(fit.history) - 1} steps"
 
 
@@ -330,3 +312,84 @@ def _warnings(findings: Findings) -> list[str]:
                 f"the band of the motion, beyond rigid-body dynamics: vibration; {fix}"
             )
     return lines
+
+
+# --- mechanisms with loops, from logs of their motors alone ---
+
+
+# Configurations between the one of the file and the first sample, so that the loops stay on their branch.
+_APPROACH = 50
+
+
+def run_mechanism(scene: LoadedScene, args) -> None:
+    """Fit, print errors and combinations of parameters, write the report."""
+    unsupported = {
+        "--out": args.out,
+        "--html": args.html,
+        "--payload-log": args.payload_log,
+        "--repair": args.repair,
+        "--method": args.method if args.method != "feasible" else None,
+        "--delay": args.delay if args.delay != ["none"] else None,
+        "--robust": args.robust if args.robust != "auto" else None,
+    }
+    if given := [name for name, value in unsupported.items() if value]:
+        raise ValueError(f"{', '.join(given)}: not for a mechanism with loops, {pathlib.Path(args.urdf).name}; omit it")
+    json_path = output_path(args.report, (".json",), "--report")
+    terms = TERMS if args.terms in (None, ["auto"]) else tuple(args.terms)
+    v_s, prior = (x if value == "auto" else float(value) for value, x in ((args.v_s, 0.01), (args.prior, 1.0)))
+    train_paths, test_paths = log_paths(args)
+    names = log_names(train_paths + test_paths)
+    raws = [raw_log(scene.system, path, args, motors=True) for path in train_paths + test_paths]
+    motors = raws[0].joint_names or ()
+    cutoff = log_cutoff(raws[: len(train_paths)], args)
+    logs = [
+        _complete(scene, filter_log(raw, path, args, cutoff), motors, path)
+        for raw, path in zip(raws, train_paths + test_paths, strict=True)
+    ]
+    train, test = logs[: len(train_paths)], logs[len(train_paths) :]
+    if not test:
+        train, test = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
+    judge = fit_mechanism(scene, train, motors, terms, v_s=v_s, prior=prior)
+    final = judge if test_paths else fit_mechanism(scene, logs, motors, terms, v_s=v_s, prior=prior)
+    tested = names[len(train_paths) :] or [f"{name} (last {100 * (1 - args.train):.3g} %)" for name in names]
+    print(
+        mechanism_text(scene, judge, final, dict(zip(tested, test, strict=True)), dict(zip(names, train, strict=False)))
+    )
+    if json_path is not None:
+        report = {
+            "file": str(args.urdf),
+            "motors": list(motors),
+            "outcome": name_of(final.fit.result),
+            "test_percent": {name: judge.fit.error(log) for name, log in zip(tested, test, strict=True)},
+            "condition": final.condition,
+            "weakest": [direction._asdict() for direction in final.weakest],
+            "interval_factor": final.factor,
+            "base_parameters": {
+                "expressions": list(final.base.expressions),
+                "nominal": final.nominal.tolist(),
+                "fitted": final.values.tolist(),
+                "std": [float(x) if np.isfinite(x) else None for x in final.std],
+            },
+            "parameters": dict(zip(final.fit.names, final.fit.values.tolist(), strict=True)),
+        }
+        write_text(json_path, json.dumps(report, indent=2) + "\n")
+        print(f"Wrote {json_path}.")
+
+
+def _complete(scene: LoadedScene, log: Log, motors: tuple[str, ...], path: str) -> Log:
+    """Log of all joints, from those of the motors and the loops, on the branch of the file's placement."""
+    model, start = scene.system, scene.starts["reference"].q
+    places = [model.q_index(name) for name in motors]
+    t, q, v, a = (np.asarray(x, np.float64) for x in (log.t, log.q, log.v, log.a))
+    approach = np.linspace(np.asarray(start)[places], q[0], _APPROACH, endpoint=False)
+    # The approach is a motion without velocity before the log, by whole seconds.
+    before = np.arange(-_APPROACH, 0) + t[0]
+    rest, tau = np.zeros_like(approach), np.zeros((_APPROACH + len(log), model.nv))
+    tau[_APPROACH:, [model.v_index(name) for name in motors]] = log.tau
+    joined = [np.concatenate(pair) for pair in ((approach, q), (rest, v), (rest, a))]
+    measured = {name: tuple(x[:, i] for x in joined) for i, name in enumerate(motors)}
+    try:
+        whole = identify.complete_log(scene, np.concatenate([before, t]), measured, tau, start)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return whole[_APPROACH:]

@@ -8,7 +8,7 @@ import warnings
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.cli.common import FILE, add_model_options, load_scene, output_path, short, table, xacro_arguments
+from jaxdyn.cli.common import FILE, add_model_options, load_scene, option, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.selection import count_free, independent_rows, select_rows
@@ -47,10 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("file", help=FILE)
     add_model_options(parser)
-    parser.add_argument(
-        "--repair",
-        metavar="OUT.urdf",
-        help="write a URDF with faulty inertias replaced by physical ones close to them (merged links stay merged)",
+    option(
+        parser,
+        "--repair OUT.urdf",
+        "write a URDF with faulty inertias replaced by physical ones close to them (merged links stay merged)",
     )
 
 
@@ -64,7 +64,12 @@ def run(args: argparse.Namespace) -> None:
     if out is not None and not is_urdf:
         raise ValueError(f"--repair {args.repair}: only URDF files can be repaired; change the inertias in {file}")
     # Read once more for the names of the file, which a model does not hold.
-    body_problems = _of_the_file(inertia_report(model), XmlFile(file, "robot", xacro_arguments(args)))
+    root = XmlFile(file, "robot", xacro_arguments(args)).root
+    names = {element.get("name") for element in root.iter() if element.tag in ("link", "body")}
+    # Massless bodies that a loader inserts between the joints of one body are no fault of the file.
+    body_problems = [
+        (body, text) for body, text in inertia_report(model) if text != "massless" or body.rpartition("::")[2] in names
+    ]
     print(describe(scene, args.file))
     print(constraint_lines(scene))
     links = urdf_inertia_report(file, arguments=xacro_arguments(args)) if is_urdf else None
@@ -76,12 +81,6 @@ def run(args: argparse.Namespace) -> None:
         # Massless bodies stay as they are and are no repairs.
         changed = [name for name, *_ in body_problems if name not in dict(inertia_report(repaired))]
         print(f"\nWrote {out}: inertias of {len(changed)} bodies repaired{_name_list(changed)}.")
-
-
-def _of_the_file(problems: list[tuple[str, str]], file: XmlFile) -> list[tuple[str, str]]:
-    """Drop the massless bodies that a loader inserts between the joints of one body."""
-    names = {element.get("name") for element in file.root.iter() if element.tag in ("link", "body")}
-    return [(body, text) for body, text in problems if text != "massless" or body.rpartition("::")[2] in names]
 
 
 def _base(scene: LoadedScene) -> str:
@@ -157,7 +156,12 @@ def _closure(scene: LoadedScene, q) -> list[str]:
     lines, closed = [], []
     try:
         q = assemble(scene, q).q
-        closed = [q, *_assemblies_near(scene, q)]
+        closed, random = [q], np.random.default_rng(0)
+        # Loops of a file that gives one pose of each body are closed in that pose only. Two others are enough to see such a gap.
+        for _ in range(2):
+            step = jnp.asarray(random.uniform(-0.1, 0.1, scene.nv), q.dtype)
+            with contextlib.suppress(ValueError):  # not every configuration nearby can be assembled
+                closed.append(assemble(scene, integrate(scene.system, q, step), guesses=1).q)
         lines.append("The constraints can be assembled: jd.assemble finds a configuration from the reference.")
     except ValueError as error:
         lines.append(f"The constraints cannot be assembled from the reference: {error}.")
@@ -169,17 +173,6 @@ def _closure(scene: LoadedScene, q) -> list[str]:
     more = f" ({here} in the singular position of the reference)" if here > freedom else ""
     lines.append(f"Degrees of freedom after constraints: {freedom} of {scene.nv}{more}")
     return lines + _repeats(scene, closed, kept)
-
-
-def _assemblies_near(scene: LoadedScene, q) -> list:
-    """A few assembled configurations around q: loops of a file that gives one pose of each body are closed in that pose only."""
-    configurations, random = [], np.random.default_rng(0)
-    # Two are enough to see a gap that does not vanish away from the file's pose.
-    for _ in range(2):
-        step = jnp.asarray(random.uniform(-0.1, 0.1, scene.nv), q.dtype)
-        with contextlib.suppress(ValueError):  # not every configuration nearby can be assembled
-            configurations.append(assemble(scene, integrate(scene.system, q, step), guesses=1).q)
-    return configurations
 
 
 def _repeats(scene: LoadedScene, closed, kept) -> list[str]:

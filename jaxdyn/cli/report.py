@@ -3,7 +3,7 @@
 import argparse
 
 from jaxdyn import scenes
-from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
+from jaxdyn.cli.common import Stopwatch, check_least, check_memory, option, whole
 from jaxdyn.reports import report
 
 HELP = "error against run time of scenes"
@@ -30,21 +30,12 @@ output (--out DIR):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="names of scenes (see --list)")
-    parser.add_argument("--list", action="store_true", help="print the scenes and exit")
-    parser.add_argument("--out", metavar="DIR", help="directory for the page, the data and the text")
-    parser.add_argument(
-        "--dtype", nargs="+", default=["float64"], metavar="T", help="float64, float32 (default: float64)"
-    )
-    parser.add_argument(
-        "--batch", nargs="+", type=whole, default=[1], metavar="N", help="trajectories at once (default: 1)"
-    )
-    parser.add_argument(
-        "--integrator",
-        nargs="+",
-        metavar="I",
-        help="method:solver, e.g. projected:Dopri8, instead of the usual ones",
-    )
-    parser.add_argument("--rounds", type=whole, default=20, metavar="N", help="timings of each run (default: 20)")
+    option(parser, "--list", "print the scenes and exit")
+    option(parser, "--out DIR", "directory for the page, the data and the text")
+    option(parser, "--dtype T ...", "float64, float32 (default: float64)", default=["float64"])
+    option(parser, "--batch N ...", "trajectories at once (default: 1)", whole, [1])
+    option(parser, "--integrator I ...", "method:solver, e.g. projected:Dopri8, instead of the usual ones")
+    option(parser, "--rounds N", "timings of each run (default: 20)", whole, 20)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -16,6 +16,7 @@ from jaxdyn.cli.common import (
     check_least,
     check_memory,
     load_scene,
+    option,
     output_path,
     per_coordinate,
     plot_motion,
@@ -79,71 +80,52 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", help=FILE)
     add_model_options(parser)
     motion = parser.add_argument_group("motion")
-    motion.add_argument("--duration", type=real, metavar="S", help="length of the motion, s (default: 2, or the log's)")
-    motion.add_argument(
-        "--sample", type=real, default=0.01, metavar="S", help="time between output rows, s (default: 0.01)"
-    )
-    motion.add_argument("--start", default="reference", metavar="NAME", help="a named state of the file (a keyframe)")
-    motion.add_argument(
-        "--q0", nargs="+", metavar="Q", help="initial q: all of it, or JOINT=VALUE to change some of it (rad, m)"
-    )
-    motion.add_argument(
-        "--v0", nargs="+", metavar="V", help="initial v, in the same form (default: that of --start; rad/s, m/s)"
-    )
-    motion.add_argument("--batch", type=whole, default=1, metavar="N", help="number of motions (default: 1)")
-    motion.add_argument(
-        "--spread", type=real, default=0.0, metavar="D", help="standard deviation of the initial state around q0"
-    )
-    motion.add_argument("--seed", type=whole, default=0, help="seed of random torques and starts (default: 0)")
+    option(motion, "--duration S", "length of the motion, s (default: 2, or the log's)", real)
+    option(motion, "--sample S", "time between output rows, s (default: 0.01)", real, 0.01)
+    option(motion, "--start NAME", "a named state of the file (a keyframe)", default="reference")
+    option(motion, "--q0 Q ...", "initial q: all of it, or JOINT=VALUE to change some of it (rad, m)")
+    option(motion, "--v0 V ...", "initial v, in the same form (default: that of --start; rad/s, m/s)")
+    option(motion, "--batch N", "number of motions (default: 1)", whole, 1)
+    option(motion, "--spread D", "standard deviation of the initial state around q0", real, 0.0)
+    option(motion, "--seed SEED", "seed of random torques and starts (default: 0)", whole, 0)
     forces = parser.add_argument_group("forces")
-    forces.add_argument(
-        "--torque", default="zero", metavar="KIND", help="zero, gravity, random, gravity+random or a log"
-    )
-    forces.add_argument(
-        "--torque-size",
-        nargs="+",
-        type=real,
-        metavar="T",
-        help="standard deviation of random torques, N m or N, one number or one per coordinate "
+    option(forces, "--torque KIND", "zero, gravity, random, gravity+random or a log", default="zero")
+    option(
+        forces,
+        "--torque-size T ...",
+        "standard deviation of random torques, N m or N, one number or one per coordinate "
         "(default: 1 %% of the effort limit, 1 where there is none)",
+        real,
     )
-    forces.add_argument(
-        "--damping",
-        nargs="+",
-        type=real,
-        metavar="D",
-        help="joint damping, N m s or N s, one number or one per coordinate (default: as the file states)",
+    option(
+        forces,
+        "--damping D ...",
+        "joint damping, N m s or N s, one number or one per coordinate (default: as the file states)",
+        real,
     )
-    forces.add_argument(
-        "--friction",
-        nargs="+",
-        type=real,
-        metavar="F",
-        help="Coulomb friction, N m or N, smoothed below 0.01 rad/s (default: as the file states)",
+    option(
+        forces,
+        "--friction F ...",
+        "Coulomb friction, N m or N, smoothed below 0.01 rad/s (default: as the file states)",
+        real,
     )
     solver = parser.add_argument_group("integration")
-    solver.add_argument("--dt", type=real, metavar="S", help="fixed steps (Runge-Kutta of order 4) of this length, s")
-    solver.add_argument(
-        "--rtol", type=real, default=1e-8, help="tolerance of adaptive steps (order 8), the default: 1e-8"
-    )
-    solver.add_argument("--max-steps", type=whole, metavar="N", help="stop after this number of steps")
-    solver.add_argument(
-        "--rank-tol",
-        type=real,
-        metavar="R",
-        help="rows of loops whose distance from the span of the others is below this part of their length are left out "
+    option(solver, "--dt S", "fixed steps (Runge-Kutta of order 4) of this length, s", real)
+    option(solver, "--rtol RTOL", "tolerance of adaptive steps (order 8), the default: 1e-8", real, 1e-8)
+    option(solver, "--max-steps N", "stop after this number of steps", whole)
+    option(
+        solver,
+        "--rank-tol R",
+        "rows of loops whose distance from the span of the others is below this part of their length are left out "
         "(default: those that stay dependent a finite distance from the start, as `jaxdyn info` lists them)",
+        real,
     )
-    solver.add_argument("--progress", action="store_true", help="show the progress of the motion")
+    option(solver, "--progress", "show the progress of the motion")
     files = parser.add_argument_group("output")
-    files.add_argument("--out", metavar="FILE", help="write the motions to FILE.csv or FILE.npz")
-    files.add_argument(
-        "--plot", metavar="FILE", help="plot positions, velocities and torques to FILE.png, .pdf or .svg"
-    )
-    files.add_argument(
-        "--html", metavar="FILE", help="write the motion as a page FILE.html that plays in a browser, offline too"
-    )
-    files.add_argument("--view", action="store_true", help="show the motion in the browser, until Ctrl-C")
+    option(files, "--out FILE", "write the motions to FILE.csv or FILE.npz")
+    option(files, "--plot FILE", "plot positions, velocities and torques to FILE.png, .pdf or .svg")
+    option(files, "--html FILE", "write the motion as a page FILE.html that plays in a browser, offline too")
+    option(files, "--view", "show the motion in the browser, until Ctrl-C")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -222,7 +204,11 @@ def _excitation(scene: LoadedScene, args):
         raise ValueError(f"--start is {args.start!r}; the named states are {', '.join(scene.starts)}")
     model, start = scene.system, scene.starts[args.start]
     q0, v0, duration = np.asarray(start.q), np.asarray(start.v), 2.0
-    size = _torque_size(model, args)
+    limit = np.asarray(model.effort_limit)
+    # Files without limits have infinity or 0 there.
+    size = jnp.asarray(np.where(np.isfinite(limit) & (limit > 0), 0.01 * limit, 1.0))
+    if args.torque_size is not None:
+        size = jnp.asarray(per_coordinate(model, args.torque_size, "--torque-size"))
     if args.torque in _KINDS:
         # Zeros and not another control: every kind of torque shares one code path.
         random = size if "random" in args.torque else 0 * size
@@ -250,14 +236,6 @@ def _excitation(scene: LoadedScene, args):
     return control, q0, v0, duration
 
 
-def _torque_size(model: Model, args) -> jax.Array:
-    if args.torque_size is not None:
-        return jnp.asarray(per_coordinate(model, args.torque_size, "--torque-size"))
-    limit = np.asarray(model.effort_limit)
-    # Files without limits have infinity or 0 there.
-    return jnp.asarray(np.where(np.isfinite(limit) & (limit > 0), 0.01 * limit, 1.0))
-
-
 def _starts(scene: Scene, q0, v0, args) -> tuple[jax.Array, jax.Array]:
     """Initial positions (n, nq) and velocities (n, nv) of the motions, on the constraints."""
     # Another seed than that of the torques, which would be correlated with the starts otherwise.
@@ -278,12 +256,12 @@ def _starts(scene: Scene, q0, v0, args) -> tuple[jax.Array, jax.Array]:
 def _forces(scene: LoadedScene, args) -> list:
     """Forces of the file, with joint damping and friction replaced by options."""
     forces = list(scene.forces)
-    for option, force in (("damping", JointDamping), ("friction", CoulombFriction)):
-        if (given := getattr(args, option)) is None:
+    for name, force in (("damping", JointDamping), ("friction", CoulombFriction)):
+        if (given := getattr(args, name)) is None:
             continue
-        values = per_coordinate(scene.system, given, f"--{option}")
+        values = per_coordinate(scene.system, given, f"--{name}")
         if np.any(values < 0):
-            raise ValueError(f"--{option} is {values.tolist()}; it must not be negative")
+            raise ValueError(f"--{name} is {values.tolist()}; it must not be negative")
         # A given value replaces that of the file; adding both would count friction twice.
         forces = [one for one in forces if not isinstance(one, force)] + ([force(values)] if values.any() else [])
     return forces
@@ -320,11 +298,8 @@ def _summarise(model: Model, solution: Solution, done: np.ndarray) -> None:
         f"energy minus work of torques and friction: at most {drift:.2e} J from its initial value, "
         f"for {exchanged:.4g} J exchanged"
     )
-    outside = _outside(model, np.asarray(solution.q)[done])
-    if outside:
-        print(f"joints beyond their limits during the motion (limits are not enforced): {', '.join(outside)}")
-
-
-def _outside(model: Model, q: np.ndarray) -> list[str]:
+    q = np.asarray(solution.q)[done]
     far = np.any((q < np.asarray(model.lower)) | (q > np.asarray(model.upper)), axis=(0, 1))
-    return [name for name, place in zip(model.joint_names, model.topology.q_slices, strict=True) if far[place].any()]
+    names = zip(model.joint_names, model.topology.q_slices, strict=True)
+    if outside := [name for name, place in names if far[place].any()]:
+        print(f"joints beyond their limits during the motion (limits are not enforced): {', '.join(outside)}")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import scale, scenes
-from jaxdyn.cli.common import Stopwatch, add_cluster_options, check_least, check_memory, connect, whole
+from jaxdyn.cli.common import Stopwatch, add_cluster_options, check_least, check_memory, connect, option, whole
 from jaxdyn.io import load_model
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.configuration import integrate, neutral
@@ -102,13 +102,13 @@ def _options(study: dict[str, Any]) -> dict[str, Any]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("study", help=".toml file that describes the study, see below")
-    parser.add_argument("--out", metavar="DIR", help="store, instead of the study's")
-    parser.add_argument("--samples", type=whole, metavar="N", help="number of rollouts, instead of the study's")
-    parser.add_argument("--seed", type=whole, metavar="N", help="seed, instead of the study's")
+    option(parser, "--out DIR", "store, instead of the study's")
+    option(parser, "--samples N", "number of rollouts, instead of the study's", whole)
+    option(parser, "--seed N", "seed, instead of the study's", whole)
     add_cluster_options(parser)
-    parser.add_argument("--devices", type=whole, metavar="N", help="CPU devices that share the rollouts (default: 1)")
-    parser.add_argument("--chunk", type=whole, metavar="N", help="rollouts per chunk (default: two seconds' work)")
-    parser.add_argument("--quiet", action="store_true", help="no progress meter")
+    option(parser, "--devices N", "CPU devices that share the rollouts (default: 1)", whole)
+    option(parser, "--chunk N", "rollouts per chunk (default: two seconds' work)", whole)
+    option(parser, "--quiet", "no progress meter")
 
 
 def run(args: argparse.Namespace) -> int:

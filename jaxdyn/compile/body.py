@@ -249,6 +249,7 @@ def _find_products(program: Program) -> dict[int, int]:
 
 
 def write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
+    """Write a call of the subprogram of a program, with pointers to its inputs and outputs."""
     name, places = symbol_of(called, e.width), [f"ptr %{k}" for k in range(len(pointers))]
     # By its address in memory: code that is better takes its place while this code runs.
     e.declared[name] = "\n".join(

@@ -241,6 +241,7 @@ class Aims(NamedTuple):
 
 
 def reaches_targets(scene: Scene, q, t, aims: Aims):
+    """Decide whether all rows are within their tolerances."""
     r = aims.weights * position_residual(scene, q, t)
     return jnp.all(jnp.abs(r) <= aims.tolerances)
 

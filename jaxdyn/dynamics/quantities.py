@@ -383,6 +383,7 @@ def first_kind_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers
 
 @kernel(static=1)
 def system_quantity(name: str, system: System, *args):
+    """Quantity of a system by the name of its method."""
     # The method is chosen by a static name, so that each quantity is one cached program.
     return getattr(system, name)(*args)
 

@@ -196,6 +196,7 @@ def joint_signals(motion: FourierMotion, robot: DrivenRobot, times):
 
 
 def make_robot(scene: Scene, motors: Sequence[str] | None, guess) -> DrivenRobot:
+    """The robot that a motion drives: the tree, or the mechanism by its motors. Checks the names and the numbers of both."""
     model: Any = scene.system
     check_bodies(model)
     if model.nq != model.nv:

@@ -61,7 +61,14 @@ def contacts_of(
         left["contacts, which the file disables"] = {}
         return [], set()
     m, collisions, spinning, soft = file.m, [], [], []
-    in_pairs = {int(g) for pair in (m.pair_geom1, m.pair_geom2) for g in pair}
+    has_two = [i for i in range(m.npair) if m.pair_friction[i, 0] != m.pair_friction[i, 1]]
+    skewed = [m.geom_bodyid[g] for i in has_two for g in _pair(m, i)]
+    if m.opt.enableflags & int(file.mujoco.mjtEnableBit.mjENBL_OVERRIDE):
+        # Friction and margin of the options are those of all geoms and pairs (MuJoCo's "contact override").
+        m.geom_friction[:], m.pair_friction[:] = m.opt.o_friction[[0, 2, 3]], m.opt.o_friction
+        m.geom_margin[:] = m.opt.o_margin
+        skewed = range(m.nbody) if m.opt.o_friction[0] != m.opt.o_friction[1] else []
+    in_pairs = {g for i in range(m.npair) for g in _pair(m, i)}
     for g in range(m.ngeom):
         # Geoms without contype and conaffinity are visual and touch nothing unless a pair names them.
         if not (m.geom_contype[g] or m.geom_conaffinity[g] or g in in_pairs):
@@ -81,7 +88,13 @@ def contacts_of(
     made, taken = contacts_with_ground(model, collisions, contacts, left, friction)
     left.add("torsional and rolling friction of bodies", [x for x in spinning if x in taken])
     left.add("margin of contacts of bodies", [x for x in soft if x in taken])
+    left.add("friction of bodies in a second direction", [x for b in skewed if (x := file.bodies[b]) in taken and x])
     return made, taken
+
+
+def _pair(m, i: int) -> set[int]:
+    """The geoms of a contact pair of the file."""
+    return {int(m.pair_geom1[i]), int(m.pair_geom2[i])}
 
 
 def _own_friction(m, g: int) -> float:
@@ -91,7 +104,7 @@ def _own_friction(m, g: int) -> float:
 def _friction(m, g: int, h: int) -> float | None:
     """Sliding friction of two geoms, None where they do not touch."""
     for i in range(m.npair):
-        if {int(m.pair_geom1[i]), int(m.pair_geom2[i])} == {g, h}:
+        if _pair(m, i) == {g, h}:
             return float(m.pair_friction[i, 0]) if m.pair_dim[i] > 1 else 0.0
     bodies = {int(m.geom_bodyid[g]), int(m.geom_bodyid[h])}
     # A signature holds the numbers of two bodies.

@@ -50,6 +50,7 @@ class CompiledFile(NamedTuple):
 
 
 def import_mujoco():
+    """MuJoCo, or an error that names its extra."""
     try:
         import mujoco
     except ImportError as error:
@@ -139,6 +140,8 @@ def _without_file(mujoco, spec, name: str) -> str:
 
 
 def assign_names(mujoco, m, path: str) -> CompiledFile:
+    """Give each body and joint of a compiled file a name: its own, or one made of its kind and number."""
+
     def all_of(kind: str, count: int) -> list[str]:
         code = getattr(mujoco.mjtObj, f"mjOBJ_{kind}")
         return [mujoco.mj_id2name(m, code, i) or "" for i in range(count)]
@@ -218,7 +221,9 @@ def _sensor(file: CompiledFile, model: Model, i: int, kind: str, options: dict) 
     place = int(m.sensor_objid[i])
     if kind in _ON_JOINTS:
         return _ON_JOINTS[kind](file.joints[place], **options)
-    frame = _frame(file, i)
+    on = file.mujoco.mjtObj(int(m.sensor_objtype[i])).name
+    # mjOBJ_BODY is the inertial frame, which has no name in the model; XBODY is the body's own.
+    frame = {"mjOBJ_SITE": file.sites, "mjOBJ_XBODY": file.bodies}.get(on, {place: None})[place]
     # A reference frame (refid) makes the reading relative, which these sensors do not support.
     if kind in _ON_FRAMES and frame is not None and m.sensor_refid[i] < 0:
         of, more = _ON_FRAMES[kind]
@@ -227,15 +232,6 @@ def _sensor(file: CompiledFile, model: Model, i: int, kind: str, options: dict) 
         mount = _mount(file, model, int(m.site_bodyid[place]))
         return None if mount is None else ForceTorque(frame, part=_WRENCHES[kind], **mount, **options)
     return None
-
-
-def _frame(file: CompiledFile, i: int) -> str | None:
-    """The frame that a sensor is on: a site, or a body with its own frame."""
-    kind, place = file.mujoco.mjtObj(int(file.m.sensor_objtype[i])).name, int(file.m.sensor_objid[i])
-    if kind == "mjOBJ_SITE":
-        return file.sites[place]
-    # mjOBJ_BODY is the inertial frame, which has no name in the model; XBODY is the body's own.
-    return file.bodies[place] if kind == "mjOBJ_XBODY" else None
 
 
 def _mount(file: CompiledFile, model: Model, body: int) -> dict | None:

@@ -77,7 +77,12 @@ class SdfFile(XmlFile):
                 continue
             own = self.name(element, scope.frame)
             if own == WORLD and element.tag == "link":
-                self._check_world_link(element)
+                # In files made from URDF such a link stands for the world, as joints to it do.
+                moved = not np.array_equal(self.raw_pose(element, f"link {WORLD!r}"), np.eye(4))
+                if (heavy := element.find("inertial") is not None) or moved:
+                    part = "an <inertial>" if heavy else "a <pose>"
+                    fault = f"the link {WORLD!r} has {part}, but its name is that of the world, to which joints go"
+                    raise self.fault(element, f"{fault}; rename it")
                 self.of_world.append(scope.prefix + own)
                 continue
             # `find` takes these names for others.
@@ -98,17 +103,6 @@ class SdfFile(XmlFile):
             inner = Scope(element, "" if alone else f"{name}::", frame, scope, static)
             self.models[frame] = inner
             self._collect(inner)
-
-    def _check_world_link(self, element) -> None:
-        """Refuse a link named "world" that moves: in files made from URDF it stands for the world, as joints to it do."""
-        what = f"link {WORLD!r}"
-        pose = self.raw_pose(element, what)
-        heavy = element.find("inertial") is not None
-        if heavy or not np.array_equal(pose, np.eye(4)):
-            part = "an <inertial>" if heavy else "a <pose>"
-            raise self.fault(
-                element, f"the {what} has {part}, but its name is that of the world, to which joints go; rename it"
-            )
 
     def find(self, name: str, scope: Scope, element) -> str:
         """Resolve a name within a scope to the frame's full name. **Raises:** ValueError for an unknown one."""

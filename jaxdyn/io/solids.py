@@ -180,19 +180,16 @@ class _Reader:
                 solids.append(Solid("plane", tuple(numbers(part, "normal", 3, np.array([0.0, 0.0, 1.0])))))
             elif part.tag == "mesh":
                 size = tuple(float(x) for x in numbers(part, "scale", 3, np.ones(3)))
-                solids += [Solid("mesh", size, *mesh) for mesh in self._mesh(uri(part))]
+                if (name := uri(part)) not in self._read:
+                    try:
+                        self._read[name] = read_mesh(find_mesh(name, self.folder))
+                    except MeshError as error:
+                        self._read[name] = []
+                        self.missing.append(f"mesh {name!r} ({error})")
+                solids += [Solid("mesh", size, *mesh) for mesh in self._read[name]]
             elif part.tag != "empty":
                 self.missing.append(f"<{part.tag}> of link {frame!r}")
         return solids
-
-    def _mesh(self, uri: str) -> list[tuple]:
-        if uri not in self._read:
-            try:
-                self._read[uri] = read_mesh(find_mesh(uri, self.folder))
-            except MeshError as error:
-                self._read[uri] = []
-                self.missing.append(f"mesh {uri!r} ({error})")
-        return self._read[uri]
 
 
 def urdf_elements(file: XmlFile, tag: str, missing: list[str]) -> Iterator[Element]:

@@ -206,7 +206,12 @@ def unread_parts(file: XmlFile, elements: Iterable[tuple[Any, str, Part]]) -> di
                     )
                 check(child, owner, entry)
             elif isinstance(entry, Left):
-                if _has_effect(file, element, child, owner, entry.default):
+                default, what = entry.default, repr(owner)
+                if isinstance(default, bool):
+                    has_effect = (child.text or "").strip() and file.flag(element, child.tag, what) is not default
+                else:
+                    has_effect = default is None or file.number(element, child.tag, default, what) != default
+                if has_effect:
                     report(entry.words, owner)
             elif child.tag not in part.children and not part.open:
                 report(f"unknown <{child.tag}> in <{element.tag}>", owner)
@@ -214,11 +219,3 @@ def unread_parts(file: XmlFile, elements: Iterable[tuple[Any, str, Part]]) -> di
     for element, owner, part in elements:
         check(element, owner, part)
     return left
-
-
-def _has_effect(file: XmlFile, element, child, owner: str, default: bool | float | None) -> bool:
-    if default is None:
-        return True
-    if isinstance(default, bool):
-        return bool((child.text or "").strip()) and file.flag(element, child.tag, repr(owner)) is not default
-    return file.number(element, child.tag, default, repr(owner)) != default

@@ -157,7 +157,15 @@ def read_parts(file: XmlFile) -> Parts:
     **Raises:** ValueError with file and line, for everything that `check_elements` refuses, and unless the links form one tree.
     """
     elements, places = check_elements(file)
-    links = {part.get("name"): _inertial(part.find("inertial")) for part in elements if part.tag == "link"}
+    links: dict[str, Inertial | None] = {}
+    for link in (part for part in elements if part.tag == "link"):
+        inertial = links[link.get("name")] = link.find("inertial")
+        if inertial is not None:
+            mass, inertia = inertial.find("mass"), inertial.find("inertia")
+            rows = [] if inertia is None else [[float(inertia.get(key)) for key in row] for row in _INERTIA_ATTRIBUTES]
+            links[link.get("name")] = Inertial(
+                None if mass is None else float(mass.get("value")), np.array(rows) if rows else None, _origin(inertial)
+            )
     joints = {part.get("name"): _joint(part) for part in elements if part.tag == "joint"}
     children: dict[str, list[str]] = {name: [] for name in links}
     for joint in joints.values():
@@ -205,16 +213,6 @@ def add_elements_without_effect(file: XmlFile, left: NotTaken) -> None:
             elements.append((element, element.get("name") or element.get("reference") or robot, tables[element.tag]))
     for what, names in unread_parts(file, elements).items():
         left.add(what, names)
-
-
-def _inertial(element) -> Inertial | None:
-    if element is None:
-        return None
-    mass, inertia = element.find("mass"), element.find("inertia")
-    matrix = (
-        None if inertia is None else np.array([[float(inertia.get(key)) for key in row] for row in _INERTIA_ATTRIBUTES])
-    )
-    return Inertial(None if mass is None else float(mass.get("value")), matrix, _origin(element))
 
 
 def _joint(element) -> Joint:

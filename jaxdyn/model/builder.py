@@ -335,6 +335,7 @@ def _float_dtype(dtype):
 
 
 def unknown(role: str, name, known) -> str:
+    """Sentence on a name that is not among the known ones, with those nearest to it."""
     near = difflib.get_close_matches(str(name), [str(k) for k in known], n=3, cutoff=0.4)
     return f"{role} {name!r} is unknown" + (f" (did you mean {', '.join(near)}?)" if near else "")
 

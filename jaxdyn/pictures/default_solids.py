@@ -126,7 +126,10 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
         # Frame A of a contact is on a surface, which gets no rod; a rigid grasp contact has two surfaces.
         if isinstance(constraint, Contact) and constraint.kind == "rigid":
             continue
-        for body, pose in constraint.ends() if _has_middles(constraint) else constraint.ends()[1:]:
+        round_surface = isinstance(constraint, RollingSphere) and constraint.on == "sphere" and not constraint.inside
+        # Both frames are points of bodies, or the first one is on a surface.
+        of_bodies = round_surface or isinstance(constraint, Loop | Distance | RollingContact)
+        for body, pose in constraint.ends() if of_bodies else constraint.ends()[1:]:
             if body is not None:
                 index = frame_index(model, body)
                 offset = np.asarray(model.frame_poses, float)[index] @ np.asarray(pose, float)
@@ -147,12 +150,6 @@ def _ground_links(scene: Scene, thin: float) -> list[Shape]:
             start = min(joints, key=lambda joint: float(np.linalg.norm(joint - end)))
             rods += [rod(None, start, end, 0.7 * thin, source="inertia")] if np.linalg.norm(end - start) > thin else []
     return rods
-
-
-def _has_middles(constraint: Pair) -> bool:
-    """Decide whether both frames of a constraint are points of bodies, and none is on a surface."""
-    round_surface = isinstance(constraint, RollingSphere) and constraint.on == "sphere" and not constraint.inside
-    return round_surface or isinstance(constraint, Loop | Distance | RollingContact)
 
 
 def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[Shape]:

@@ -282,6 +282,9 @@ class _Picture:
             self.drawn.append(self.ax.add_collection3d(faces, autolim=False))
 
     def _lines(self, row: int, length: float) -> None:
+        from matplotlib.patheffects import withStroke
+
+        halo = [withStroke(linewidth=3, foreground="white", alpha=0.8)]
         for place, axis in self.axes:
             ends = np.stack([place[0, row] - length * axis[0, row], place[0, row] + length * axis[0, row]])
             self._plot(ends, color=AXIS, linewidth=1.1, alpha=0.8)
@@ -299,7 +302,8 @@ class _Picture:
             else:
                 self._plot(path, color="0.25", linewidth=1.0, zorder=12)
                 self._plot(at[None], color="0.1", marker="o", markersize=4 if name else 0, zorder=25)
-            self.drawn.append(self.ax.text(*(at + 0.3 * length), name, fontsize=9, zorder=30))
+            # A name is read in front of bodies and lines that it crosses.
+            self.drawn.append(self.ax.text(*(at + 0.3 * length), name, fontsize=9, zorder=30, path_effects=halo))
 
 
 def cone_sides(cone: Cone, row: int, height: float) -> np.ndarray:

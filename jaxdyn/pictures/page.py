@@ -341,6 +341,7 @@ HOST = "127.0.0.1"
 
 
 def start_server(port: int) -> Any:
+    """Start a server of viser on this machine."""
     try:
         import viser
     except ImportError as error:
@@ -353,6 +354,7 @@ def start_server(port: int) -> Any:
 
 
 def stop_server(server) -> None:
+    """Stop a server without its messages, and forget its port."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
     _port_filter.ports.discard(server.get_port())

@@ -159,7 +159,10 @@ def paint_sectors(shapes: Shapes, model: Model) -> Shapes:
     """
     parts = []
     for shape in shapes:
-        turns = shape.source == "constraint" or (shape.source == "inertia" and _turns_freely(shape, model))
+        body = -1 if shape.frame is None else model.topology.frame_bodies[model.frame_names.index(shape.frame)]
+        free = ("free", "spherical", "planar", *(["continuous"] if shape.kind == "cylinder" else []))
+        turns_freely = shape.source == "inertia" and body >= 0 and model.topology.kinds[body] in free
+        turns = shape.source == "constraint" or turns_freely
         if not turns or shape.frame is None or shape.kind not in ("ellipsoid", "cylinder"):
             parts.append(shape)
             continue
@@ -177,12 +180,6 @@ def paint_sectors(shapes: Shapes, model: Model) -> Shapes:
                 )
             )  # fmt: skip
     return Shapes(parts, shapes.missing)
-
-
-def _turns_freely(shape: Shape, model: Model) -> bool:
-    body = -1 if shape.frame is None else model.topology.frame_bodies[model.frame_names.index(shape.frame)]
-    kinds = ("free", "spherical", "planar", *(["continuous"] if shape.kind == "cylinder" else []))
-    return body >= 0 and model.topology.kinds[body] in kinds
 
 
 def color_of(shape: Shape, model) -> tuple[float, float, float]:

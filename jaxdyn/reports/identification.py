@@ -272,8 +272,8 @@ def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title:
     parts = [text_block(text)]
     for number, one in enumerate(findings.tests):
         # Each sample is a point of an SVG path: whole logs would make pages of many megabytes.
-        thin = _subsample(one)
-        figure = torque_figure(thin.log, thin.predicted, labels, units, title=one.name)
+        rows = slice(0, len(one.log), max(1, len(one.log) // _MOST_SAMPLES))
+        figure = torque_figure(one.log[rows], one.predicted[rows], labels, units, title=one.name)
         parts += [
             f"<h2>{html.escape(one.name)}</h2>",
             svg(figure, f"torque{number}"),
@@ -282,12 +282,6 @@ def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title:
     if isinstance(findings.result, RobotFit):
         parts += ["<h2>Base parameters</h2>", svg(_interval_figure(findings.result), "intervals")]
     return document(title, parts)
-
-
-def _subsample(one: Evaluation) -> Evaluation:
-    """Subsample to the resolution of a plot."""
-    rows = slice(0, len(one.log), max(1, len(one.log) // _MOST_SAMPLES))
-    return Evaluation(one.name, one.log[rows], one.predicted[rows], one.nominal[rows])
 
 
 def _spectrum(one: Evaluation, labels: Sequence[str]) -> Any:

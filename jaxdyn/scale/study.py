@@ -251,28 +251,28 @@ class Study:
 
     def chunks(self, chunks: Sequence[int]) -> list[Summary]:
         """Compute and store chunks, or read those that the store has; damaged ones are computed again."""
-        return [self._chunk(chunk) for chunk in chunks]
-
-    def _chunk(self, chunk: int) -> Summary:
-        numbers = self.store.numbers(chunk)
-        # Also a task that was lost with its worker may have been finished: Dask computes it again, this reads it.
-        is_there = self.store.is_done(chunk)
-        is_whole = is_there and self.store.is_whole(chunk)
-        if not is_whole:
-            # Missing until it is whole. Only of a damaged one: the codes of another task may come at any time.
-            if is_there:
-                self.store.forget(chunk)
-            with self.computing:
-                rows = compute(self.program, numbers)
-            partials = self.reducer.partials(rows, numbers)
-            self.store.write(chunk, {name: rows[name] for name in self.kept} | self.reducer.to_store(partials))
-            codes = rows["result"]
-        else:
-            codes = self.store.read(chunk, ["result"])["result"]
-            partials = self.reducer.from_store(partial(self.store.read, chunk))
-        failed = numbers[np.flatnonzero(codes)[:LISTED]]
-        counts = np.bincount(codes, minlength=len(self.outputs.codes))
-        return Summary(counts, failed, partials, is_there and not is_whole)
+        summaries = []
+        for chunk in chunks:
+            numbers = self.store.numbers(chunk)
+            # Also a task that was lost with its worker may have been finished: Dask computes it again, this reads it.
+            is_there = self.store.is_done(chunk)
+            is_whole = is_there and self.store.is_whole(chunk)
+            if not is_whole:
+                # Missing until it is whole. Only of a damaged one: the codes of another task may come at any time.
+                if is_there:
+                    self.store.forget(chunk)
+                with self.computing:
+                    rows = compute(self.program, numbers)
+                partials = self.reducer.partials(rows, numbers)
+                self.store.write(chunk, {name: rows[name] for name in self.kept} | self.reducer.to_store(partials))
+                codes = rows["result"]
+            else:
+                codes = self.store.read(chunk, ["result"])["result"]
+                partials = self.reducer.from_store(partial(self.store.read, chunk))
+            failed = numbers[np.flatnonzero(codes)[:LISTED]]
+            counts = np.bincount(codes, minlength=len(self.outputs.codes))
+            summaries.append(Summary(counts, failed, partials, is_there and not is_whole))
+        return summaries
 
 
 def compute(program: Program, numbers: np.ndarray) -> dict[str, np.ndarray]:

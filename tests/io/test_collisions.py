@@ -1,11 +1,10 @@
 """Contacts of collision shapes of files with the ground: shapes, friction, choice, and what is left out."""
 
-import warnings
-
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from loading import silent
 
 import jaxdyn as jd
 from jaxdyn.contact.shapes import hull_vertices
@@ -21,13 +20,6 @@ SIZES = {
 COUNTS = {"box": 8, "sphere": 1, "cylinder": 8, "capsule": 2, "mesh": 4, "ellipsoid": 1}
 TETRAHEDRON = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
 OBJ = "".join(f"v {x} {y} {z}\n" for x, y, z in TETRAHEDRON) + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
-
-
-def load(path, **options):
-    """Load a file without warnings."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return jd.load(path, **options)
 
 
 def touching_of(scene):
@@ -56,7 +48,7 @@ def urdf(tmp_path):
 def test_urdf_shapes_touch_the_ground(urdf):
     """Every kind, its friction and its gaps in closed form; the fixed base is named."""
     pytest.importorskip("trimesh")
-    scene = load(urdf, contacts="ground")
+    scene = silent(urdf, contacts="ground")
     assert any("collision shapes without contacts: base (fixed)" in line for line in scene.not_taken)
     touching = touching_of(scene)
     q, c, s = jnp.full(5, 0.2), np.cos(0.3), np.sin(0.3)
@@ -77,19 +69,19 @@ def test_urdf_shapes_touch_the_ground(urdf):
 
 def test_chosen_links_and_refusals(urdf):
     """Only named links have contacts; names and values that do not fit are refused."""
-    scene = load(urdf, contacts=["sphere", "capsule"])
+    scene = silent(urdf, contacts=["sphere", "capsule"])
     assert set(touching_of(scene)) == {"sphere", "capsule 0", "capsule 1"}
-    assert not touching_of(load(urdf))
+    assert not touching_of(silent(urdf))
     with pytest.raises(
         ValueError, match=r"link 'sphre' is unknown \(did you mean sphere.*\); it has no collision shape"
     ):
-        load(urdf, contacts=["sphre"])
+        silent(urdf, contacts=["sphre"])
     for wrong in ("floor", 3, [1]):
         with pytest.raises(ValueError, match="give 'ground', a list of names of links"):
-            load(urdf, contacts=wrong)
+            silent(urdf, contacts=wrong)
     with pytest.raises(ValueError, match=r"contacts\['sphere'\] is 0; give a positive"):
-        load(urdf, contacts={"sphere": 0})
-    lowest = touching_of(load(urdf, contacts={"sphere": 1, "box": 4}))
+        silent(urdf, contacts={"sphere": 0})
+    lowest = touching_of(silent(urdf, contacts={"sphere": 1, "box": 4}))
     assert sorted(lowest) == ["box 0", "box 1", "box 2", "box 3", "sphere"]
 
 
@@ -105,16 +97,16 @@ def test_ground_for_a_whole_robot_asks_for_the_links_that_touch(tmp_path):
     path = tmp_path / "robot.urdf"
     path.write_text(f'<robot name="r"><link name="base"/>{"".join(parts)}</robot>')
     with pytest.raises(ValueError, match=r"'ground' gives 72 contacts, of the links leg 0, leg 1.*List the links"):
-        load(path, contacts="ground")
-    assert len(touching_of(load(path, contacts=links))) == 72
-    assert len(touching_of(load(path, contacts=dict.fromkeys(links, 4)))) == 36
+        silent(path, contacts="ground")
+    assert len(touching_of(silent(path, contacts=links))) == 72
+    assert len(touching_of(silent(path, contacts=dict.fromkeys(links, 4)))) == 36
 
 
 def test_meshes_that_cannot_be_read_are_named(urdf):
     """A missing file; a hull of many vertices, of which twelve are contacts."""
     pytest.importorskip("trimesh")
     (urdf.parent / "hull.obj").unlink()
-    scene = load(urdf, contacts="ground")
+    scene = silent(urdf, contacts="ground")
     assert any("mesh 'hull.obj' (no such file)" in line for line in scene.not_taken)
     points = np.random.default_rng(0).normal(size=(500, 3))
     points /= np.linalg.norm(points, axis=1)[:, None]
@@ -159,7 +151,7 @@ def test_sdf_shapes_touch_a_plane(tmp_path):
     surface = {"box": friction(0.3, "<mu2>0.2</mu2>"), "sphere": friction(0.9), "capsule": bounce}
     text = "".join(COLLISION.format(name, size, surface.get(name, "")) for name, size in parts.items())
     path.write_text(SDF.format(floor=f"<surface>{friction(0.7)}</surface>", collisions=text))
-    scene = load(path, contacts="ground")
+    scene = silent(path, contacts="ground")
     touching = touching_of(scene)
     counts = [len([key for key in touching if key.startswith(f"m::b {i}")]) for i in range(5)]
     assert counts == [8, 1, 8, 2, 1] and len(touching) == 20
@@ -178,7 +170,7 @@ def test_sdf_shapes_touch_a_plane(tmp_path):
     ):
         assert words in lines
     assert "<collision> of links" not in lines
-    assert "<collision> of links: floor::slab, m::b" in "; ".join(load(path).not_taken)
+    assert "<collision> of links: floor::slab, m::b" in "; ".join(silent(path).not_taken)
     with pytest.warns(jd.io.NotTakenWarning, match="cone"):
         assert len(touching_of(jd.load(path, contacts=["m::b"]))) == 20
 
@@ -202,7 +194,7 @@ def test_mjcf_geoms_touch_a_plane(tmp_path):
     """Every kind, with MuJoCo's rules: bits, condim, priority, pairs, exclusions; distances are those of MuJoCo."""
     path = tmp_path / "scene.xml"
     path.write_text(MJCF.format(ground=FLOOR, more=""))
-    scene = load(path, contacts="ground")
+    scene = silent(path, contacts="ground")
     touching = touching_of(scene)
     assert len(touching) == 8 + 1 + 8 + 2 + 4 + 1
     assert float(touching["b 0 0"].coefficient) == 0.7 and float(touching["b 1"].coefficient) == 0.9
@@ -211,7 +203,7 @@ def test_mjcf_geoms_touch_a_plane(tmp_path):
     lines = "; ".join(scene.not_taken)
     assert "collision shapes without contacts: world (fixed)" in lines and "contact geometry of bodies: c" in lines
     assert "torsional and rolling friction of bodies: b" in lines
-    assert "contact geometry of bodies: world, b, c, d" in "; ".join(load(path).not_taken)
+    assert "contact geometry of bodies: world, b, c, d" in "; ".join(silent(path).not_taken)
     m = mujoco.MjModel.from_xml_path(str(path))
     m.geom_margin[:] = 10.0
     d = mujoco.MjData(m)
@@ -236,12 +228,37 @@ def test_mjcf_geoms_touch_a_plane(tmp_path):
     assert set(touching) == {"c"} and float(touching["c"].coefficient) == 0.3
 
 
+@pytest.mark.parametrize("second", [0.2, 0.3])
+def test_mjcf_override_of_friction_is_mujocos(second, tmp_path):
+    """Of all geoms and pairs, by priority or not; another coefficient in the second direction is named."""
+    path = tmp_path / "scene.xml"
+    pairs = '<contact><pair geom1="floor" geom2="ball" friction="0.6 0.5 0 0 0"/></contact>'
+    override = f'<option o_friction="0.2 {second}" o_margin="10"><flag override="{{}}able"/></option>'
+    for flag, ball in (("dis", 0.6), ("en", 0.2)):
+        path.write_text(MJCF.format(ground=FLOOR, more=pairs + override.format(flag)))
+        scene = silent(path, contacts="ground")
+        touching = touching_of(scene)
+        m = mujoco.MjModel.from_xml_path(str(path))
+        m.geom_margin[:] = m.pair_margin[:] = 10.0
+        mujoco.mj_forward(m, d := mujoco.MjData(m))
+        theirs = {m.body(m.geom_bodyid[contact.geom].max()).name: set() for contact in d.contact}
+        for contact in d.contact:
+            if m.geom("floor").id in contact.geom:
+                theirs[m.body(m.geom_bodyid[contact.geom].max()).name].add(contact.friction[0])
+        for name in "bcd":
+            assert {float(one.coefficient) for key, one in touching.items() if key[0] == name} == theirs[name]
+        assert theirs["c"] == {ball}
+        named = [line for line in scene.not_taken if line.startswith("friction of bodies in a second direction: ")]
+        expected = ["b, c, d"] if flag == "en" and second == 0.3 else [] if flag == "en" else ["c"]
+        assert [line.partition(": ")[2] for line in named] == expected
+
+
 def test_mjcf_height_fields_and_no_ground(tmp_path):
     """Heights at the nodes and a plane z = 0 where the file has none; a file that disables contacts."""
     path = tmp_path / "scene.xml"
     field = '<geom type="hfield" hfield="h" pos="0 0 0.25"/>'
     path.write_text(MJCF.format(ground=field, more=""))
-    touching = touching_of(load(path, contacts=["d"]))
+    touching = touching_of(silent(path, contacts=["d"]))
     on = touching["d"].contact.on
     assert isinstance(on, jd.contact.HeightField)
     m = mujoco.MjModel.from_xml_path(str(path))
@@ -255,10 +272,10 @@ def test_mjcf_height_fields_and_no_ground(tmp_path):
             np.testing.assert_allclose(on.height(jnp.array([x, y])), height, atol=1e-7)
     np.testing.assert_allclose(touching["d"].contact.surface[2, 3], 0.25)
     path.write_text(MJCF.format(ground="", more=""))
-    scene = load(path, contacts=["d"])
+    scene = silent(path, contacts=["d"])
     contact = touching_of(scene)["d"].contact
     assert isinstance(contact.on, jd.contact.Plane)
     np.testing.assert_allclose(contact.position(scene.system, scene.starts["reference"].q, 0.0), 3.8, atol=1e-15)
     path.write_text(MJCF.format(ground=FLOOR, more='<option><flag contact="disable"/></option>'))
-    scene = load(path, contacts="ground")
+    scene = silent(path, contacts="ground")
     assert not touching_of(scene) and "contacts, which the file disables" in scene.not_taken

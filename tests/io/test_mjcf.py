@@ -10,18 +10,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from loading import silent
 from mujoco_bridge import APART, Oracle, agreement
 
 import jaxdyn as jd
 from jaxdyn.constraints.base import position_residual
-
-
-def silent(path) -> jd.io.LoadedScene:
-    """The scene of a file, whatever is not taken."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the compiler's own too, of attributes that are to go
-        return jd.load(path)
-
 
 MIXED = """
 <mujoco model="mixed">

@@ -1,12 +1,12 @@
 """SDF files: poses of every version, trees and loops, couplings, and what is refused."""
 
-import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from loading import silent
 from pinocchio_bridge import quick
 from scipy.linalg import expm
 
@@ -23,13 +23,6 @@ def write(tmp_path, text: str, version: str = "1.7") -> Path:
     path = tmp_path / "robot.sdf"
     path.write_text(f"<sdf version='{version}'>\n{text}\n</sdf>", encoding="utf-8")
     return path
-
-
-def silent(path, **options) -> jd.io.LoadedScene:
-    """The scene of a file, whatever is not taken."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", jd.io.NotTakenWarning)
-        return jd.load(path, **options)
 
 
 def joint(name, parent, child, kind="revolute", pose="", axis="<xyz>0 0 1</xyz>", rest="") -> str:

@@ -1,12 +1,12 @@
 """Each element and attribute of a file is read, refused, in `not_taken`, or has no effect on the motion."""
 
 import re
-import warnings
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from loading import silent
 
 import jaxdyn as jd
 from jaxdyn.io import unread
@@ -15,9 +15,7 @@ from jaxdyn.io.unread import Left, Part
 
 def load(path, text: str):
     path.write_text(text, encoding="utf-8")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        return jd.load(path)
+    return silent(path)
 
 
 INERTIAL = "<inertial><mass>2</mass></inertial>"

@@ -320,6 +320,11 @@ def test_chains_of_mimic_joints(urdf):
 TREE = (link("a"), link("b"))
 
 
+def hinge(inside="", *rest, kind="revolute"):
+    """Two links and their joint j, with more elements in it, and further parts."""
+    return *TREE, joint("j", "a", "b", inside, kind), *rest
+
+
 def test_followers_of_fixed_joints_are_held_at_their_offset(urdf):
     follow = '<axis xyz="0 0 1"/><mimic joint="{}" multiplier="2" offset="{}"/>'
     path = urdf(
@@ -348,8 +353,8 @@ BAD_FILES = {
     "link without name": ((link("a"), "<link/>"), 3, "a <link> has no name"),
     "joint without name": ((*TREE, joint("", "a", "b")), 4, "a <joint> has no name"),
     "link twice": ((*TREE, link("a")), 4, "the link name 'a' is taken at .*:2; rename one"),
-    "joint twice": ((*TREE, joint("j", "a", "b"), joint("j", "a", "b")), 7, "the joint name 'j' is taken at .*:4"),
-    "type": ((*TREE, joint("j", "a", "b", kind="hinge")), 4, "joint 'j' has type 'hinge', which is unknown; types are"),
+    "joint twice": (hinge("", joint("j", "a", "b")), 7, "the joint name 'j' is taken at .*:4"),
+    "type": (hinge(kind="hinge"), 4, "joint 'j' has type 'hinge', which is unknown; types are"),
     "no type": ((*TREE, '<joint name="j"><parent link="a"/><child link="b"/></joint>'), 4, "'j' has type None"),
     "no parent": ((*TREE, '<joint name="j" type="fixed"><child link="b"/></joint>'), 4, "'j' has no <parent>"),
     "no child": ((*TREE, '<joint name="j" type="fixed"><parent link="a"/></joint>'), 4, "'j' has no <child>"),
@@ -360,37 +365,21 @@ BAD_FILES = {
     ),
     "unknown link": ((*TREE, joint("j", "a", "x")), 5, "joint 'j': the child link 'x' is not in the file"),
     "two roots": ((*TREE, link("c"), joint("j", "a", "b")), None, "2 root links: a, c; join them by a joint"),
-    "two parents": ((*TREE, joint("j", "a", "b"), joint("k", "a", "b")), 7, "'b' is the child of joints 'j' and 'k'"),
-    "cycle": ((*TREE, joint("j", "a", "b"), joint("k", "b", "a")), 7, "links a, b form a cycle"),
+    "two parents": (hinge("", joint("k", "a", "b")), 7, "'b' is the child of joints 'j' and 'k'"),
+    "cycle": (hinge("", joint("k", "b", "a")), 7, "links a, b form a cycle"),
     "cycle apart": ((*TREE, link("c"), joint("j", "b", "c"), joint("k", "c", "b")), 8, "links b, c form a cycle"),
     "own parent": ((*TREE, joint("j", "b", "b")), 4, "links b form a cycle"),
-    "text for numbers": (
-        (*TREE, joint("j", "a", "b", '<origin xyz="1 2 x"/>')),
-        6,
-        "xyz of <origin> of joint 'j' is '1 2 x'",
-    ),
-    "two for three": ((*TREE, joint("j", "a", "b", '<axis xyz="1 2"/>')), 6, "'1 2'; give 3 finite numbers"),
+    "text for numbers": (hinge('<origin xyz="1 2 x"/>'), 6, "xyz of <origin> of joint 'j' is '1 2 x'"),
+    "two for three": (hinge('<axis xyz="1 2"/>'), 6, "'1 2'; give 3 finite numbers"),
     "NaN mass": ((link("a", SOLID.replace('"1"/>', '"nan"/>', 1)),), 2, "value of <mass> of link 'a' is 'nan'"),
-    "infinite limit": (
-        (*TREE, joint("j", "a", "b", '<limit upper="inf"/>')),
-        6,
-        "upper of <limit> of joint 'j' is 'inf'",
-    ),
-    "negative mass": (
-        (link("a", SOLID.replace('value="1"', 'value="-2"')),),
-        2,
-        "link 'a': the mass is -2.0 kg",
-    ),
+    "infinite limit": (hinge('<limit upper="inf"/>'), 6, "upper of <limit> of joint 'j' is 'inf'"),
+    "negative mass": ((link("a", SOLID.replace('value="1"', 'value="-2"')),), 2, "link 'a': the mass is -2.0 kg"),
     "inertia with a gap": ((link("a", SOLID.replace('izz="1"', "")),), 2, "<inertia> of link 'a' has no izz"),
-    "zero axis": (
-        (*TREE, joint("j", "a", "b", '<axis xyz="0 0 0"/>')),
-        4,
-        "joint 'j': axis is .*direction other than zero",
-    ),
-    "quaternion": ((*TREE, joint("j", "a", "b", '<origin quat_xyzw="0 0 0 1"/>')), 6, "has quat_xyzw.*write it as rpy"),
-    "crossed limits": ((*TREE, joint("j", "a", "b", '<limit lower="1" upper="-1"/>')), 4, "lower limit 1.0 is above"),
+    "zero axis": (hinge('<axis xyz="0 0 0"/>'), 4, "joint 'j': axis is .*direction other than zero"),
+    "quaternion": (hinge('<origin quat_xyzw="0 0 0 1"/>'), 6, "has quat_xyzw.*write it as rpy"),
+    "crossed limits": (hinge('<limit lower="1" upper="-1"/>'), 4, "lower limit 1.0 is above"),
     "no inertia": ((*TREE[:1], link("b", ""), joint("j", "a", "b")), None, "joint 'j' .*moves no inertia"),
-    "mimic without joint": ((*TREE, joint("j", "a", "b", "<mimic/>")), 6, "<mimic> of joint 'j' has no joint"),
+    "mimic without joint": (hinge("<mimic/>"), 6, "<mimic> of joint 'j' has no joint"),
     "mimic of nothing": ((*TREE, COUPLED[0]), 4, "'j' follows 'k'; joint 'k' is unknown; .*mimic='ignore'"),
     "mimic of floating": (
         (*TREE, *(part.format("floating") for part in COUPLED)),
@@ -403,20 +392,12 @@ BAD_FILES = {
         "a second <inertial> of link 'a', the first is on line 2; keep one",
     ),
     "second axis": (
-        (*TREE, joint("j", "a", "b", '<axis xyz="1 0 0"/><axis xyz="0 1 0"/>')),
+        hinge('<axis xyz="1 0 0"/><axis xyz="0 1 0"/>'),
         6,
         "a second <axis> of joint 'j', the first is on line 6",
     ),
-    "negative effort": (
-        (*TREE, joint("j", "a", "b", '<limit effort="-1"/>')),
-        6,
-        "effort of <limit> of .*its magnitude",
-    ),
-    "negative velocity": (
-        (*TREE, joint("j", "a", "b", '<limit velocity="-1"/>')),
-        6,
-        "velocity of <limit> of .*its magnitude",
-    ),
+    "negative effort": (hinge('<limit effort="-1"/>'), 6, "effort of <limit> of .*its magnitude"),
+    "negative velocity": (hinge('<limit velocity="-1"/>'), 6, "velocity of <limit> of .*its magnitude"),
 }
 
 

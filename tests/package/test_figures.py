@@ -84,24 +84,3 @@ def test_code_that_a_command_measures_exists():
         "jaxdyn/io",
         "jaxdyn/scale",
     )
-
-
-# Tables that are older than the limit and wait for `make figures` on a quiet machine, by page: how many.
-WAITING = {
-    "benchmarks.md": 3,
-    "constraints.md": 1,
-    "dependencies.md": 1,
-    "extremes.md": 3,
-    "identification.md": 3,
-    "report.md": 1,
-    "scale.md": 3,
-}
-
-
-@history
-@pytest.mark.slow
-def test_tables_are_younger_than_the_limit():
-    """Not in every run: a table grows old by commits to other code."""
-    old = [table.page.name for page in PAGES for table in figures.tables(page) if figures.age(table)[0] > figures.LIMIT]
-    counts = {name: old.count(name) for name in old}
-    assert counts == WAITING, f"python -m benchmarks.figures --stale lists {counts}"

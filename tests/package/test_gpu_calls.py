@@ -273,19 +273,18 @@ def test_the_assembler_says_what_it_refuses(gpu, monkeypatch):
         doubled(46.0)(jnp.ones((3, 2)))
 
 
-@pytest.mark.parametrize("what", ["device", "stream"])
-def test_errors_of_xla_are_handed_on(gpu, what):
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        ({"fails": "device"}, "XLA has no answer"),
+        ({"fails": "stream"}, "XLA has no answer"),
+        ({"device": device.MAX_DEVICES}, "kernels know 64 devices of a process"),
+    ],
+)
+def test_errors_of_xla_and_of_its_devices_are_handed_on(gpu, state, words):
     call, x = doubled(44.0), jnp.ones((3, 2))
-    gpu_stand_in.XLA.fails = what
-    with pytest.raises(jax.errors.JaxRuntimeError, match="XLA has no answer"):
-        call(x)
-    assert not gpu.launches
-
-
-def test_a_device_beyond_the_table_is_an_error(gpu):
-    call, x = doubled(45.0), jnp.ones((3, 2))
-    gpu_stand_in.XLA.device = device.MAX_DEVICES
-    with pytest.raises(jax.errors.JaxRuntimeError, match="kernels know 64 devices of a process"):
+    vars(gpu_stand_in.XLA).update(state)
+    with pytest.raises(jax.errors.JaxRuntimeError, match=words):
         call(x)
     assert not gpu.launches
 

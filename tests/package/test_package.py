@@ -1,12 +1,9 @@
 """The package as a whole: what imports what, what importing it costs, and the versions it stands on."""
 
 import ast
-import re
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
@@ -137,15 +134,6 @@ def reachable(module: str) -> dict[str, str]:
     return computed
 
 
-def name_of(tree: ast.AST) -> str:
-    """The last name of `a`, `a.b`, `a.b.c`."""
-    return getattr(tree, "attr", getattr(tree, "id", ""))
-
-
-def test_version_is_set():
-    assert re.fullmatch(r"\d+\.\d+\.\d+([a-z.+].*)?", jaxdyn.__version__)
-
-
 def test_package_is_typed():
     assert (PACKAGE / "py.typed").exists()
 
@@ -192,35 +180,10 @@ def test_outside_packages_stay_where_they_belong():
     assert not wrong, "\n".join(wrong)
 
 
-def test_only_programs_switch_to_float64():
-    """Calls of `enable_x64`, `config.update("jax_enable_x64", ...)`, assignments and the environment variable."""
-    wrong = []
-    for module, tree in SOURCES.items():
-        # A careful program is traced in a thread of its own, which begins with the precision of its kernel.
-        if module in PROGRAMS or module == "compile.mode":
-            continue
-        for node in ast.walk(tree):
-            call = isinstance(node, ast.Call)
-            first = node.args[0] if call and node.args else None
-            if (
-                (call and name_of(node.func) == "enable_x64")
-                or (call and name_of(node.func) == "update" and getattr(first, "value", "") == "jax_enable_x64")
-                or (isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and "enable_x64" in node.attr)
-                or (isinstance(node, ast.Constant) and node.value == "JAX_ENABLE_X64")
-            ):
-                wrong.append(f"{module or 'jaxdyn'}:{node.lineno}")
-    assert not wrong, wrong
-
-
-def run_in_new_process(program: str) -> None:
-    done = subprocess.run([sys.executable, "-c", program], cwd=PACKAGE.parent, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.long
-def test_import_is_light_and_leaves_jax_unconfigured():
-    """In a fresh interpreter: no optional or heavy package, and no array made before the user chooses devices and dtype."""
-    run_in_new_process("""
+# Programs that run in a fresh interpreter, by what they show.
+PROGRAMS_ALONE = {
+    # No optional or heavy package, and no array made before the user chooses devices and dtype.
+    "import is light and leaves jax unconfigured": """
 import sys
 import jaxdyn
 heavy = {"diffrax", "equinox", "lineax", "llvmlite", "matplotlib", "optax", "optimistix", "scipy"} & sys.modules.keys()
@@ -236,13 +199,9 @@ try:
 except RuntimeError:
     raise SystemExit("importing jaxdyn runs jax: a module makes an array or calls a jax function when it is imported")
 assert not jax.config.jax_enable_x64
-""")
-
-
-@pytest.mark.long
-def test_modules_import_without_optional_packages():
-    """Every module but the command and the one that Dask's workers import, as after `pip install jaxdyn`."""
-    run_in_new_process(f"""
+""",
+    # Every module but the command and the one that Dask's workers import, as after `pip install jaxdyn`.
+    "modules import without optional packages": f"""
 import importlib, pkgutil, sys
 class Missing:
     def find_spec(self, name, path=None, target=None):
@@ -253,12 +212,8 @@ import jaxdyn
 for module in pkgutil.walk_packages(jaxdyn.__path__, "jaxdyn."):
     if module.name not in ("jaxdyn.__main__", "jaxdyn.tasks.worker"):
         importlib.import_module(module.name)
-""")
-
-
-@pytest.mark.long
-def test_dynamics_scenes_and_readers_of_mechanisms_import_no_integrator():
-    run_in_new_process("""
+""",
+    "dynamics, scenes and readers of mechanisms import no integrator": """
 import sys
 import jax
 import numpy as np
@@ -270,13 +225,9 @@ jd.scenes.four_bar()
 jd.load
 names = {"diffrax", "lineax", "matplotlib", "optax", "optimistix", "scipy", "jaxdyn.simulation"}
 assert not names & sys.modules.keys(), names & sys.modules.keys()
-""")
-
-
-@pytest.mark.long
-def test_functions_that_were_compiled_before_the_first_use_stay_compiled():
-    """No module makes a context of JAX, for which JAX would trace every function of the process again."""
-    run_in_new_process("""
+""",
+    # No module makes a context of JAX, for which JAX would trace every function of the process again.
+    "functions that were compiled before the first use stay compiled": """
 import jax
 import jaxdyn
 traced = []
@@ -288,15 +239,8 @@ import diffrax, optax, optimistix
 jaxdyn.simulate(jaxdyn.robots.chain(1), [0.1], [0.0], [0.0, 0.1])
 function(1.0)
 assert len(traced) == 1
-""")
-
-
-@pytest.mark.long
-def test_names_are_the_same_in_every_order_of_imports():
-    """A function and a subpackage must not share a name: Python binds the subpackage to it when that is imported."""
-    modules = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert not [name for name in modules & set(jaxdyn.__all__) if not isinstance(getattr(jaxdyn, name), ModuleType)]
-    run_in_new_process("""
+""",
+    "names are the same in every order of imports": """
 import pickle
 import jaxdyn.control
 assert jaxdyn.control.OperationalSpace.__name__ == "OperationalSpace"
@@ -308,13 +252,9 @@ assert pickle.loads(pickle.dumps(jd.simulate)) is jd.simulate and pickle.loads(p
 assert jd.lie.so3 is jd.so3
 from jaxdyn import *
 assert simulate is jd.simulate and "ast" not in dir(jd)
-""")
-
-
-@pytest.mark.long
-def test_first_simulate_compiles_one_program():
-    """Programs of XLA beside the motion's own are only those that ask XLA for its options (`select_options`)."""
-    run_in_new_process("""
+""",
+    # Programs of XLA beside the motion's own are only those that ask XLA for its options (`select_options`).
+    "the first simulate compiles one program": """
 import jax
 import jax._src.compiler as compiler
 import numpy as np
@@ -328,15 +268,22 @@ scene, start = jd.scenes.four_bar(), jd.scenes.four_bar.start()
 for _ in range(2):
     jd.simulate(scene, *start[:2], np.linspace(0.0, 0.1, 3))
 assert [name for name in names if "lambda" not in name] == ["jit_smooth_motion"], names
-""")
+""",
+}
 
 
-def test_excluded_jax_is_neither_installed_nor_allowed():
-    assert "0.10.2" not in {metadata.version("jax"), metadata.version("jaxlib")}
-    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    pins = [line for line in project["dependencies"] if re.match(r"jax(lib)?[^a-z]", line)]
-    assert len(pins) == 2
-    assert all("!=0.10.2" in line for line in pins)
+@pytest.mark.long
+@pytest.mark.parametrize("name", PROGRAMS_ALONE)
+def test_in_a_new_process(name):
+    command = [sys.executable, "-c", PROGRAMS_ALONE[name]]
+    done = subprocess.run(command, cwd=PACKAGE.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_functions_and_subpackages_share_no_name():
+    """Python binds a subpackage to its name when that is imported."""
+    modules = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert not [name for name in modules & set(jaxdyn.__all__) if not isinstance(getattr(jaxdyn, name), ModuleType)]
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float64, 1e-14), (jnp.float32, 1e-5)])

@@ -222,9 +222,9 @@ def _arguments(function):
     ]
 
 
-def test_no_row_of_a_table_is_empty():
+def test_tables_describe_all_arguments_and_no_others():
     """Of all exports and the methods of exported classes; what a docstring leaves to another one is found there."""
-    things = {}
+    things, unknown = {}, []
     for name in [name for page in PAGES for name, _ in entries(page)[1:]] + ["scale.run", "scale.evaluate"]:
         value = jd
         for part in name.split("."):
@@ -239,6 +239,10 @@ def test_no_row_of_a_table_is_empty():
                 # Fields that a class sets itself are no arguments.
                 if not inspect.isclass(one) or "__init__" in vars(one) or issubclass(one, tuple):
                     things[full] = (inspect.getdoc(one), given)
+                every = inspect.signature(one).parameters
+                if not any(p.kind is p.VAR_KEYWORD for p in every.values()):
+                    heads = re.findall(r"(?:^|^- |; |\. )`(\w+)`[:,]", argument_tables.split(things[full][0])[1], re.M)
+                    unknown += [f"{full} has no argument {head}" for head in heads if head not in every]
     known = argument_tables.descriptions(things)
     assert len(things) > 250
     empty = [
@@ -247,7 +251,7 @@ def test_no_row_of_a_table_is_empty():
         for row in argument_tables.rows(argument_tables.split(text)[1], given, known)[1]
         if not row.text
     ]
-    assert not empty, "\n".join(empty)
+    assert not empty and not unknown, "\n".join([*empty, *unknown])
 
 
 def test_what_a_docstring_leaves_to_another_one_is_found_there():

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import jaxdyn as jd
 from jaxdyn.io import NotTakenWarning
@@ -419,28 +420,31 @@ def test_draw_and_animate(turning, solids, urdf, tmp_path):
     jd.draw(jd.load_model(urdf), jnp.asarray([0.3, -0.2]), axes, shapes=solids)
 
 
-def test_draw_refuses(turning, tmp_path):
-    scene, solution = turning
-    with pytest.raises(ValueError, match=r"LagrangianSystem, which has no bodies.*jd\.plot\.states"):
-        jd.draw(jd.scenes.pendulum(), jnp.zeros(1))
-    with pytest.raises(ValueError, match=r"shape \(2,\).*\(3,\) = \(nq,\)"):
-        jd.draw(scene, jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"\.gif or \.mp4"):
-        jd.animate(scene, solution, tmp_path / "turn.avi")
-    with pytest.raises(ValueError, match="on frames elsewhere, which model"):
-        jd.draw(scene, solution.q[0, 0], shapes=[Shape("elsewhere", "box", (1.0, 1.0, 1.0))])
-    with pytest.raises(ValueError, match="give jd"):
-        jd.draw(scene, solution.q[0, 0], shapes="robot.urdf")
-    with pytest.raises(ValueError, match="projection '3d'"):
-        from matplotlib.figure import Figure
+SQUARE = Shape("elsewhere", "box", (1.0, 1.0, 1.0))
+# What is wrong, by the words of the error, for a scene, its solution and a folder.
+REFUSED = {
+    r"LagrangianSystem, which has no bodies.*jd\.plot\.states": lambda *_: jd.draw(jd.scenes.pendulum(), jnp.zeros(1)),
+    r"shape \(2,\).*\(3,\) = \(nq,\)": lambda scene, *_: jd.draw(scene, jnp.zeros(2)),
+    r"\.gif or \.mp4": lambda scene, turn, folder: jd.animate(scene, turn, folder / "turn.avi"),
+    "on frames elsewhere, which model": lambda scene, turn, _: jd.draw(scene, turn.q[0, 0], shapes=[SQUARE]),
+    "give jd": lambda scene, turn, _: jd.draw(scene, turn.q[0, 0], shapes="robot.urdf"),
+    "projection '3d'": lambda scene, turn, _: jd.draw(scene, turn.q[0, 0], Figure().add_subplot()),
+    "ffmpeg is not installed; install it": lambda scene, turn, folder: jd.animate(scene, turn, folder / "turn.mp4"),
+    "is the scene that of the solution": lambda _, turn, __: motion.motion_of(jd.scenes.windows(), turn),
+    r"write to a file \.html": lambda scene, turn, folder: jd.pictures.save_html(folder / "turn.txt", scene, turn),
+    "there is no directory": lambda scene, turn, folder: jd.pictures.save_html(folder / "no" / "a.html", scene, turn),
+    "LagrangianSystem, which has no bodies": lambda _, __, folder: jd.pictures.save_html(
+        folder / "turn.html", jd.scenes.pendulum(), jnp.zeros(1)
+    ),
+    "port is 70000; give a number": lambda scene, turn, _: jd.view(scene, turn, port=70000),
+}
 
-        jd.draw(scene, solution.q[0, 0], Figure().add_subplot())
-    if shutil.which("ffmpeg") is None:
-        with pytest.raises(ValueError, match="ffmpeg is not installed; install it"):
-            jd.animate(scene, solution, tmp_path / "turn.mp4")
-    other = jd.scenes.slider_crank() if scene.nq != 3 else jd.scenes.windows()
-    with pytest.raises(ValueError, match="is the scene that of the solution"):
-        motion.motion_of(other, solution)
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_cannot_be_shown_is_refused(words, turning, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(ValueError, match=words):
+        REFUSED[words](*turning, tmp_path)
 
 
 def test_rows_that_were_not_reached_repeat_the_last():
@@ -498,18 +502,6 @@ def test_page_is_one_small_file_with_the_whole_motion(page, turning, capsys):
     kinds = {m["type"] for _, m in messages}
     assert {"MeshMessage", "ArrowMessage", "GridMessage", "SetCameraPositionMessage"} <= kinds
     assert capsys.readouterr().out == ""
-
-
-def test_page_refuses(turning, tmp_path):
-    scene, solution = turning
-    with pytest.raises(ValueError, match=r"write to a file \.html"):
-        jd.pictures.save_html(tmp_path / "turn.txt", scene, solution)
-    with pytest.raises(ValueError, match="there is no directory"):
-        jd.pictures.save_html(tmp_path / "no" / "turn.html", scene, solution)
-    with pytest.raises(ValueError, match="LagrangianSystem, which has no bodies"):
-        jd.pictures.save_html(tmp_path / "turn.html", jd.scenes.pendulum(), jnp.zeros(1))
-    with pytest.raises(ValueError, match="port is 70000; give a number"):
-        jd.view(scene, solution, port=70000)
 
 
 def test_view_serves_a_page_on_this_machine(turning, monkeypatch, capsys):

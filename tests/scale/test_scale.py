@@ -700,6 +700,19 @@ def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
         ('mean = "energy"', 'median = "energy"', "give one of mean"),
         ("duration = 0.1", "duration = ", "is malformed TOML"),
         ('"study.py"', '"rolling_disk"', "rolling_disk has no parameter angle"),
+        ("duration = 0.1", "duration = inf", "duration inf s"),
+        ("duration = 0.1", "duration = [1]", r"duration is \[1\]"),
+        ("points = 3", "points = 1", "points 1;"),
+        ("points = 3", "points = 100000000000000", "points 100000000000000: .* GB of results"),
+        ("samples = 12", "samples = 1e3", "samples is 1000.0; see"),
+        ("points = 3", "seed = 100000000000000000000", "seed is 1000"),
+        ('outputs = ["energy"]', "outputs = [1]", r"outputs is \[1\]; give a list of names"),
+        (STUDY[STUDY.index("[parameters]") :], "parameters = 3", "parameters is 3; see"),
+        ("stepsize = 0.01", "foo = 1", r"\[options\] foo is 1; options are atol, "),
+        ("length = 0.7", "length = nan", "parameter length is nan; give a finite number"),
+        ("uniform = [-1.0, 1.0]", "uniform = [1.0, inf]", "parameter speed is .*inf.*; give a finite number"),
+        ("size = 2", "size = -1", "size is -1; give a whole number"),
+        ('units = "N m s"', "units = 3", "units of damping are 3; give a text"),
     ],
 )
 def test_sweep_refuses(tmp_path, capsys, old, new, error):
@@ -710,7 +723,7 @@ def test_sweep_refuses(tmp_path, capsys, old, new, error):
     (tmp_path / "study.py").write_text(FUNCTIONS)
     assert main(["sweep", str(study), "--quiet"]) == 2
     said = capsys.readouterr().err
-    assert re.search(error, said), said
+    assert re.search(error, said) and said.count("\n") == 1, said
     assert not (tmp_path / "study.zarr").exists()
 
 
