@@ -273,15 +273,16 @@ def attach_derivative(groups: Groups, W, y, scale, width, x):
 @attach_derivative.defjvp
 def _attach_derivative_jvp(groups: Groups, primals, tangents):
     W, y, scale, width, x = primals
-    # The recursion lets second derivatives account for the motion of x, which y does not contain.
+    # The recursion lets second derivatives account for the motion of x, which neither y nor its change contains.
     moving = attach_derivative(groups, W, y, scale, width, x)
-    y = y + matmul(W, moving - jax.lax.stop_gradient(moving))
+    motion = moving - jax.lax.stop_gradient(moving)
+    y, rate = y + matmul(W, motion), tangents[1] + matmul(tangents[0], motion)
     _, D, along = _residual(groups, moving, y, width)
     blocks = _blocks(D, along)
     (_, DS), shift = zip(*blocks, strict=True), _shift(scale, _SHIFT_OF_DERIVATIVE)
     matrix = _newton_matrix(groups, blocks, W, shift)
     _, by_width = jax.jvp(lambda width: _residual(groups, moving, y, width)[0], (width,), (tangents[3],))
-    right = -(by_width[:, None] + _apply(groups, DS, tangents[1][:, None]))
+    right = -(by_width[:, None] + _apply(groups, DS, rate[:, None]))
     solve = solver_of(matrix)
     change = solve(right)
     # One refinement removes the shift along the range of W.

@@ -196,7 +196,7 @@ def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb 
     def by_arrays():
         return matmul(jnp.asarray(topology.dof_ancestors, rows.dtype), of_coordinates)
 
-    return _accumulate(topology, jnp.add, jnp.zeros_like(rows[0]), rows, by_arrays)
+    return _accumulate(topology, jnp.add, jnp.zeros(rows.shape[1:], rows.dtype), rows, by_arrays)
 
 
 def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
@@ -206,7 +206,7 @@ def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array,
     def by_arrays():
         return matmul(jnp.asarray(topology.ancestors.T, rows.dtype), rows)
 
-    sums = _accumulate(topology, jnp.add, jnp.zeros_like(rows[0]), rows, by_arrays, inward=True)
+    sums = _accumulate(topology, jnp.add, jnp.zeros(rows.shape[1:], rows.dtype), rows, by_arrays, inward=True)
     return take(sums, topology.dof_body)
 
 

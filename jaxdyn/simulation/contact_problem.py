@@ -390,7 +390,8 @@ class _Reaction(NamedTuple):
 def _in_units(contacts: Contacts, flow: _Flow, Y, place, velocity, terms, velocities, bound, reaction: _Reaction):
     """Problem with rows of a mean length of one."""
     one, gram = jnp.ones((), Y.dtype), matmul(Y.T, Y)
-    squares = jax.lax.stop_gradient(jnp.diagonal(gram))
+    # Coulomb's law is the same in all units; the width of a smooth one is a speed in these, which change with the place.
+    squares = jnp.diagonal(gram)
     units, start = [], 0
     for size in contacts.sizes:
         mean = jnp.mean(squares[start : start + size])

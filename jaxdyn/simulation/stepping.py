@@ -146,28 +146,31 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
     method, dtype = choose_method(scene, "auto"), state_dtype(scene.system)
     unknown, known = partition_tracers(scene)
 
-    def unpack(args):
-        """Scene with its independent rows, with forces fixed to a piece where flags ask for it, and tau."""
-        unknown, tau, selection, *positive = args
+    # Time of the integration begins at zero in each step: the length of steps and their number are the same at any t, which
+    # rounding of t + dt would change.
+    def unpack(since, args):
+        """Scene with its independent rows, with forces fixed to a piece where flags ask for it, time, and tau."""
+        unknown, tau, begin, selection, *positive = args
         scene = known(unknown)
         scene = scene if selection is None else keep_rows(scene, selection)
-        return fix_pieces(scene, pieces, *positive) if positive else scene, tau
+        return fix_pieces(scene, pieces, *positive) if positive else scene, begin + since, tau
 
     @jax.jit
-    def field(t, y, args):
-        scene, tau = unpack(args)
+    def field(since, y, args):
+        scene, t, tau = unpack(since, args)
         q, v, in_basis = method.to_qv_and_basis(scene, y, t)
         force, (torque, of_drives) = scene.applied_force(q, v, t), scene.drive_torque(q, v, t, tau, y.get(DRIVES))
         force = torque if force is None else torque + force
         rates = method.rates(scene, y, q, v, t, force, in_basis)
         return rates if of_drives is None else rates | {DRIVES: of_drives}
 
-    def project(t, y, error, args):
-        y, error = method.end_step(unpack(args)[0], y, t, error)
+    def project(since, y, error, args):
+        scene, t, _ = unpack(since, args)
+        y, error = method.end_step(scene, y, t, error)
         return y, y, error
 
-    def switching(t, y, args):
-        scene, tau = unpack(args)
+    def switching(since, y, args):
+        scene, t, tau = unpack(since, args)
         state = (*method.to_qv(scene, y, t), *(y[name] for name in of_drives))
         return values_and_levels(lambda q, v, *own: guards(scene, q, v, t, tau if limits_vary else None, *own), *state)
 
@@ -188,7 +191,8 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
         y = method.start(scene, q, v, t) | dict(zip(of_drives, z, strict=True))
         # Once, at the start on the constraints: between the stages of a step the rank would change.
         selection = hide_unclear(select_rows(known(unknown), q, t, None)) if selects_rows else None
-        plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
+        plan, args, size = solver.plan(y), (unknown, tau, t, selection), length / substeps
+        ts = jnp.stack([jnp.zeros_like(t), jnp.asarray(length, t.dtype)])
         if pieces.names:
             if is_standalone():
                 raise ValueError(
@@ -202,7 +206,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
             # A scalar program has no loop over steps; they are written one after the other.
             flat = ravel_pytree(y)[0]
             for i in range(substeps):
-                start, end = t + i * size, t + (i + 1) * size
+                start, end = (jnp.asarray(k * size, t.dtype) for k in (i, i + 1))
                 flat = take_step(plan, args, start, end, flat, plan.first_rate(args, start, flat)).projected
             return state_of(plan.structure(flat), t + length)
         else:
