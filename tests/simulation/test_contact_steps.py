@@ -362,6 +362,39 @@ def test_derivatives_are_those_of_differences():
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("smoothing", [0.0, 1e-3])
+def test_second_derivatives_where_the_rows_of_contacts_turn(smoothing):
+    """The tip of a double pendulum closes: Hessians are symmetric and the differences of gradients, these those of values.
+
+    W changes with the place here, and impulses with W. Without that product Hessians were off by half of their size, and with
+    smooth friction gradients by 1e-3, as they missed that of the speed that counts as none.
+    """
+    builder, rod = jd.ModelBuilder("arm"), (1.0, (0, 0, -0.25), (0.02, 0.02, 0.01))
+    builder.add_body("a", None, "revolute", rod, axis=(0, 1, 0), pose=(0, 0, 0.8))
+    builder.add_body("b", "a", "revolute", rod, axis=(0, 1, 0), pose=(0, 0, -0.5))
+    tip = jd.contact.shape_contacts("b", jd.contact.Sphere(1e-3), (0, 0, -0.5), friction=0.5, name="tip")
+    scene = jd.Scene(builder.build(), forces=list(tip))
+    step = jd.stepper(scene, 0.004, smoothing=smoothing)
+    x = jnp.array([0.5030538659654246, 0.26718114270442905, -2.198251178967941, 1.5813294315252768])
+    weights = jnp.array([0.3, -1.0, 0.7, 0.2])
+    assert jd.stepper(scene, 0.004, report=True)((x[:2], x[2:]), jnp.zeros(2))[1].forces["tip"][2] > 50
+
+    @jax.jit
+    def loss(x):
+        return weights @ jnp.concatenate(step((x[:2], x[2:]), jnp.zeros(2)))
+
+    gradient = jax.jit(jax.grad(loss))
+    hessian = jax.jit(jax.hessian(loss))(x)
+    h = 1e-5
+    slopes = [(loss(x + h * e) - loss(x - h * e)) / (2 * h) for e in jnp.eye(4)]
+    np.testing.assert_allclose(gradient(x), slopes, atol=1e-8 * np.abs(slopes).max())
+    differences = [(gradient(x + h * e) - gradient(x - h * e)) / (2 * h) for e in jnp.eye(4)]
+    size = np.abs(hessian).max()
+    np.testing.assert_allclose(hessian, differences, atol=1e-7 * size)  # of second order in h
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-12 * size)
+
+
 @pytest.mark.parametrize("slope", [0.0, 0.2])
 def test_ball_that_rolls_fast_does_not_sink(slope):
     """At 2 m/s, where v^2/r is above 2 g: below the ground by the bend of one step, w^2 r h^2/2, and as fast as it should be."""
