@@ -143,6 +143,8 @@ def inverse_kinematics(
     rows = as_targets(scene.system, targets)
     model: Model = scene.system
     guess, t = check_state(model, q=guess, t=t)
+    if is_concrete(guess) and not np.isfinite(np.asarray(guess)).all():
+        raise ValueError(f"guess is {np.asarray(guess)}; give finite numbers")
     check_search(steps, guesses, atol)
     if posture is not None:
         (posture,) = check_state(model, q_posture=posture)

@@ -215,7 +215,8 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray
     """
     places, powers = [], []
     for log, residual in zip(logs, residuals, strict=True):
-        rate = log_rate(log)
+        # A single sample has no rate, and no frequency but zero.
+        rate = log_rate(log) or 1.0
         frequency = np.fft.rfftfreq(len(residual), 1 / rate)
         most = rate / 2 if log.cutoff is None else min(0.6 * log.cutoff, rate / 2)
         # Offsets are fitted, so that the mean says nothing.

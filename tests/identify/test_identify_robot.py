@@ -639,6 +639,9 @@ def test_white_residuals():
     assert is_white([low], [low.tau]).tolist() == [False, True]
     assert is_white([low, low], [low.tau, low.tau]).tolist() == [False, True]
     generator = np.random.default_rng(1)
+    assert (
+        is_white([raw, raw[:1]], [slow, slow[:1]]).tolist() == [False, True] and is_white([raw[:1]], [slow[:1]]).all()
+    )
     false = [not is_white([raw], [generator.normal(size=(2001, 1))]).all() for _ in range(300)]
     assert sum(false) <= 3
 

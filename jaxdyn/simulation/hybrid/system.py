@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from jaxdyn.compile import kernel
+from jaxdyn.compile import kernel, solver_of
 from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
@@ -31,6 +31,7 @@ from jaxdyn.simulation.hybrid.reactions import (
     normal_loads,
     react,
     rebounds,
+    slides,
 )
 from jaxdyn.simulation.hybrid.transitions import (
     SLIDES,
@@ -359,8 +360,30 @@ class ModalSystem(HybridSystem):
         return ravel_pytree(y | {"v": kernel(self._impact)(unknown, collision, t, y["q"], y["v"])})[0]
 
     def _impact(self, unknown, collision: Collision, t, q, v):
-        scene = self._bind(unknown)[0]
-        return impact(scene, self.elements, collision, terms_at(scene, self.elements, q, v, t), v)[0]
+        scene, elements = self._bind(unknown)[0], self.elements
+        terms, slip = terms_at(scene, elements, q, v, t), jax.lax.stop_gradient(collision.slip)
+
+        def velocity(slip):
+            return impact(scene, elements, collision._replace(slip=slip), terms, v)[0]
+
+        if not elements.planar.any():
+            return velocity(slip)
+        turns = jnp.asarray(elements.planar) & slides(elements, collision.mode) & ~collision.held
+
+        def excess(flat):
+            """What the directions (2 n,) lack of those of the velocity behind the impact, against which friction acts."""
+            rates = terms.row.velocity + matmul(terms.row.A, velocity(flat.reshape(slip.shape)) - v)
+            size, unit = length(rates_of(elements, rates)[1])
+            turned = jnp.where((turns & (size > tolerance(v.dtype)))[:, None], unit, jax.lax.stop_gradient(slip))
+            return turned.reshape(-1) - flat
+
+        # The directions are known; steps of Newton's method that change no value give them their derivatives, one order each.
+        flat = slip.reshape(-1)
+        solve = solver_of(jax.lax.stop_gradient(jax.jacfwd(excess)(flat)))
+        for _ in range(2):
+            missing = excess(flat)
+            flat = flat - solve((missing - jax.lax.stop_gradient(missing))[:, None])[:, 0]
+        return velocity(flat.reshape(slip.shape))
 
     def slip(self, y):
         return self.plan.structure(y)["slip"]
