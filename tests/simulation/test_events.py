@@ -519,6 +519,16 @@ def test_constraints_are_closed_at_coarse_tolerances_too():
     assert run(stepsize=0.2).result == jd.RESULTS.coarse_steps
 
 
+def point(friction, restitution=0.0):
+    """A point of 1 kg above the ground, by its coordinates."""
+    builder = jd.ModelBuilder("point")
+    for name, parent, axis in (("x", None, (1, 0, 0)), ("y", "x", (0, 1, 0))):
+        builder.add_body(name, parent, "prismatic", axis=axis)
+    builder.add_body("z", "y", "prismatic", (1.0, (0, 0, 0), (1, 1, 1)), axis=(0, 0, 1))
+    contact = jd.contact.ground_contact("z", friction=friction, restitution=restitution)
+    return jd.Scene(builder.build(), forces=[contact])
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("adjoint", ["reverse", "direct"])
 def test_the_direction_of_friction_in_an_impact_has_derivatives(adjoint):
@@ -526,11 +536,7 @@ def test_the_direction_of_friction_in_an_impact_has_derivatives(adjoint):
 
     With directions that were constants to derivatives, gradients of a bounce were wrong by some per cent.
     """
-    builder, g, mu, e = jd.ModelBuilder("point"), 9.81, 0.3, 0.5
-    for name, parent, axis in (("x", None, (1, 0, 0)), ("y", "x", (0, 1, 0))):
-        builder.add_body(name, parent, "prismatic", axis=axis)
-    builder.add_body("z", "y", "prismatic", (1.0, (0, 0, 0), (1, 1, 1)), axis=(0, 0, 1))
-    scene = jd.Scene(builder.build(), forces=[jd.contact.ground_contact("z", friction=mu, restitution=e)])
+    scene, g, mu, e = point(0.3, 0.5), 9.81, 0.3, 0.5
     end, weights = 0.1, jnp.array([0.3, -1.0, 0.7, 0.2, 1.1, -0.6])
 
     def simulated(x):
@@ -551,3 +557,23 @@ def test_the_direction_of_friction_in_an_impact_has_derivatives(adjoint):
     np.testing.assert_allclose(jax.jit(jax.grad(simulated))(x), jax.grad(exact)(x), atol=1e-9)
     if adjoint == "direct":
         np.testing.assert_allclose(jax.jit(jax.hessian(simulated))(x), jax.hessian(exact)(x), rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.long
+def test_the_direction_in_which_friction_yields_has_derivatives():
+    """A force that turns and grows moves a point from rest: gradients are the differences of values.
+
+    Sliding begins in a fixed direction, which was a constant to derivatives: they were off by 3e-4.
+    """
+    scene, weights = point(0.3), jnp.array([0.3, -1.0, 0.0, 0.2, 0.7, 0.0])
+
+    @jax.jit
+    def simulated(p):
+        force = lambda q, v, t: jnp.array([p[0] * t, p[1] * t**2, 0.0])  # noqa: E731
+        solution = jd.simulate(scene, jnp.zeros(3), jnp.zeros(3), jnp.array([0.0, 1.0]), control=force)
+        return weights @ jnp.concatenate([solution.q[-1], solution.v[-1]])
+
+    p, h = jnp.array([6.0, 4.0]), 1e-3
+    differences = [(simulated(p + h * e) - simulated(p - h * e)) / (2 * h) for e in jnp.eye(2)]
+    # The differences are of second order in h, and values have the tolerance of the run.
+    np.testing.assert_allclose(jax.jit(jax.grad(simulated))(p), differences, atol=1e-7)

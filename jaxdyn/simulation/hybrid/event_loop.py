@@ -356,8 +356,8 @@ def _cross(system: HybridSystem, unknown, mode: Mode, record: Records, t, known_
     time = jnp.where(hit, known_time + late, t)
     # To the event by the motion before it: a shift of value zero, with the first and second derivatives of the time.
     y = _shift(system.plan, (unknown, mode), known_time, y, late)
-    y = system.impact(unknown, record.impact, time, y)
-    return time, system.with_slip(y, None, lax.stop_gradient(record.slip))
+    slip = system.slip_behind(unknown, mode, record.mode, lax.stop_gradient(record.slip), time, y)
+    return time, system.with_slip(system.impact(unknown, record.impact, time, y), None, slip)
 
 
 def _shift(plan, args, t, y, late):

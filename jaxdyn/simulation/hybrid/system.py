@@ -95,6 +95,10 @@ class HybridSystem:
     def slip(self, y) -> Any:
         """Directions of sliding (n, 2) of a state."""
 
+    def slip_behind(self, unknown, mode: Mode, following: Mode, slip, t, y) -> Any:
+        """Directions `slip` behind an event between two modes, with derivatives where they stay fixed."""
+        return slip
+
     @abstractmethod
     def with_slip(self, y, v, slip) -> Any:
         """State with this velocity and these directions; v None to keep the velocity."""
@@ -387,6 +391,18 @@ class ModalSystem(HybridSystem):
 
     def slip(self, y):
         return self.plan.structure(y)["slip"]
+
+    def slip_behind(self, unknown, mode: Mode, following: Mode, slip, t, y):
+        if not self.elements.planar.any():
+            return slip
+        y = self.plan.structure(y)
+        holding, *_ = kernel(self._friction)(unknown, mode, y["slip"], t, y["q"], y["v"])
+        # From rest an element slides against the friction that held it, and so until it is fast enough to have a direction.
+        begins, creeps = (following.creep > 0) & mode.stick, (following.creep > 0) & ~mode.stick
+        fixed = jnp.where(begins[:, None], length(-holding)[1], y["slip"])
+        known = jax.lax.stop_gradient(fixed)
+        is_same = jnp.sum((known - slip) ** 2, 1) < tolerance(slip.dtype)
+        return slip + jnp.where(((begins | creeps) & is_same)[:, None], fixed - known, 0.0)
 
     def with_slip(self, y, v, slip):
         y = self.plan.structure(y)
