@@ -16,7 +16,7 @@ PYTEST := $(BIN)/python $(RUN)
 NATIVE := $(shell grep -rl "mark.native" tests --include="test_*.py")
 # The files that touch JAX's internals, dynamics, constraints and simulation, which the oldest versions run.
 CORE := $(wildcard tests/compile/test_*.py $(patsubst %,tests/*/test_%.py,constrained constrained_kernels constrained_motion \
-	constraints dynamics events explicit_steps fixed_steps kernels_of_mechanics package projection readme recursions recursions_kernels \
+	constraints dynamics events explicit_steps fixed_steps kernels_of_mechanics package pages projection recursions recursions_kernels \
 	reduced reverse rows sharding shared_numbers simulate stepper stiff traced users_functions variational))
 # Most of a test of mechanics is compiling, by XLA and by LLVM. This leaves a third of that out, and changes no more than rounding
 # (tests/conftest.py adds the flags of XLA that the installed version knows).
