@@ -17,7 +17,7 @@ from jaxdyn.compile import target
 pytestmark = pytest.mark.native
 
 PACKAGE = Path(jd.__file__).parent
-MODULES = "known", "batch", "kernels", "repair"
+MODULES = "known", "batch", "kernels"
 RNG = np.random.default_rng(0)
 
 
