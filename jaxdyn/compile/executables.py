@@ -1,4 +1,4 @@
-"""What is called outside of traces: entry points, numbers of known arguments, and the trial of an unknown version of JAX.
+"""Calls outside of traces: entry points, numbers of known arguments, and the trial of an unknown version of JAX.
 
 Entry points are executables that are kept on disk: in a second process nothing of them is traced, lowered or compiled.
 

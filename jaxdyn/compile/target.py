@@ -401,7 +401,7 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
 
 
 def _write_quick(program, width: int, write: Callable) -> Callable[[], str] | None:
-    """What writes the text of a large program as a listing, write(is_quick=True); None for others."""
+    """Function that writes the text of a large program as a listing, write(is_quick=True); None for other programs."""
     program = getattr(program, "turn", program)
     if not (width and stored.has_two_levels() and isinstance(program, Program)):
         return None

@@ -111,8 +111,8 @@ def fit_gains(
 
     **Returns:** `DriveGains`.
 
-    **Raises:** ValueError when logs and model do not fit together, for an unknown body, for fewer
-    samples than unknowns of a joint, and where the payload identifies no gain.
+    **Raises:** ValueError when logs and model do not fit together, for an unknown body, for fewer samples than unknowns of a
+    joint, and where the payload identifies no gain.
 
     Source: Gautier & Briot (2014), "Global identification of joint drive gains and dynamic parameters of robots", ASME Journal of
     Dynamic Systems, Measurement, and Control 136; errors here are those of the currents, which least squares over both allows.

@@ -375,7 +375,7 @@ class ModalSystem(HybridSystem):
         turns = jnp.asarray(elements.planar) & slides(elements, collision.mode) & ~collision.held
 
         def excess(flat):
-            """What the directions (2 n,) lack of those of the velocity behind the impact, against which friction acts."""
+            """Directions (2 n,) of the velocity behind the impact, against which friction acts, minus those that are assumed."""
             rates = terms.row.velocity + matmul(terms.row.A, velocity(flat.reshape(slip.shape)) - v)
             size, unit = length(rates_of(elements, rates)[1])
             turned = jnp.where((turns & (size > tolerance(v.dtype)))[:, None], unit, jax.lax.stop_gradient(slip))
