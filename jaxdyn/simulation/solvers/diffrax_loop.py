@@ -24,7 +24,6 @@ from jaxdyn.simulation.solvers.choice import innermost
 from jaxdyn.simulation.solvers.driver import COUNTS, FORWARD, ROOM
 from jaxdyn.simulation.solvers.guards import delay
 
-
 _FIRST_ORDER = (
     'this method has first derivatives in reverse mode alone; forward mode (jax.jvp, jax.jacfwd) needs adjoint="forward" of '
     'jd.simulate, Hessians need adjoint="direct", or adjoint="forward" and jax.jacfwd twice'
