@@ -36,9 +36,8 @@ from jaxdyn.cli.identify_options import (
 from jaxdyn.cli.identify_tables import error_table, gains_text, mechanism_text, payload_text, tables
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
-from jaxdyn.identify.applied_fits import fit_mechanism
 from jaxdyn.identify.descent import on_one_thread
-from jaxdyn.identify.linear_fit import base_terms
+from jaxdyn.identify.linear_fit import base_terms, fit_mechanism
 from jaxdyn.identify.raw_logs import check_log_content, check_rest, vibration
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.io import save_urdf

@@ -14,7 +14,7 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.condensed_fit import Setting, eliminate, fit_blocks, share_of_extra
 from jaxdyn.identify.logs import filter_like_log, idle_coordinates, samples_for_jumps, travel_ranges
 from jaxdyn.identify.raw_logs import check_log_content, check_rest, motion_band, vibration
-from jaxdyn.identify.regression import block_slices, condense, condense_model, condense_rows
+from jaxdyn.identify.regression import block_slices, condense_model
 from jaxdyn.identify.robot_logs import RobotLogs, huber_weights
 from jaxdyn.identify.selection import improving_torques, is_clear, log_errors, splits, standard_error
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
@@ -203,7 +203,7 @@ def test_loads_that_have_not_settled_are_said(truth, monkeypatch):
     loaded[10:20] += np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
     held = measured(arm(), motion(3), loaded, noise=0.02, seed=3)
     assert bool(identify.fit_payload(model, log(1), held, robot=fit).success)
-    monkeypatch.setattr("jaxdyn.identify.applied_fits.MOST_ROUNDS", 1)
+    monkeypatch.setattr("jaxdyn.identify.payloads.MOST_ROUNDS", 1)
     short = identify.fit_payload(model, log(1), held, robot=fit)
     assert short.result is RESULTS.max_steps_reached and "NOT CONVERGED" in payload_text(short)
     basic, extra, where = split_terms(terms, 2)
@@ -605,16 +605,6 @@ def test_two_halves_agree_within_their_intervals(truth):
     )
     z = (first.values - second.values) / np.hypot(first.std, second.std)
     assert np.sqrt(np.mean(z**2)) < 1.5
-
-
-def test_one_log_condenses_as_before(truth):
-    """R of `condense` and of the rows of its blocks are one."""
-    model = arm()
-    log = measured(model, motion(1), truth)
-    blocks = condense_model(model, [log], blocks=4)
-    one, two = condense(model, log), condense_rows(blocks.rows(np.ones(2)), blocks.count())
-    np.testing.assert_allclose(one.R.T @ one.R, two.R.T @ two.R, atol=1e-10)
-    assert one.rows == two.rows == 600
 
 
 def test_share_of_the_variance_that_extra_terms_cause():
