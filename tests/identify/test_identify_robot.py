@@ -660,7 +660,8 @@ def test_a_joint_that_hardly_moved_has_no_friction_from_data(truth):
     slow = identify.Log(bare.t, bare.q * size, bare.v * size, bare.a * size, bare.tau)
     assert idle_coordinates(model, [slow]) == (1,) and idle_coordinates(model, [slow, bare]) == ()
     log = measured(model, slow, truth, noise=0.05)
-    fit = identify.fit_robot(model, log)
+    with pytest.warns(identify.LogWarning, match=r"log 1: b_joint .* hardly moved"):
+        fit = identify.fit_robot(model, log)
     sources = dict(zip(fit.intervals.parameters.names, fit.intervals.parameters.sources, strict=True))
     for term in identify.TERMS:
         assert sources[f"b_joint.{term}"] in ("hardly moved", "bound")
@@ -705,6 +706,20 @@ def test_log_checks(truth):
     assert any("are they in degrees" in line for line in changed(q=np.rad2deg(good.q)))
     still = changed(q=good.q * [1, 0], v=good.v * [1, 0], a=good.a * [1, 0])
     assert any(line.startswith("b (0 rad) hardly moved") for line in still)
+
+
+def test_fits_warn_of_logs_in_other_units_and_of_starts_at_rest(truth):
+    """By the lines of the command, with the number of the log; the rest is a second with a torque of its own."""
+    model, good = arm(), measured(arm(), motion(1), truth, noise=0.01)
+    given = {"terms": identify.TERMS, "v_s": 0.01, "prior": 1.0, "robust": None, "weights": None}
+    scaled = identify.Log(good.t, good.q, good.v, good.a, 1000 * good.tau)
+    with pytest.warns(identify.LogWarning, match="log 2: torques of a_joint, b_joint are about .* N mm"):
+        identify.fit_robot(model, [good, scaled], **given)
+    held = [np.concatenate([np.full((50, 2), row), x]) for row, x in ((good.q[0], good.q), (0, good.v), (0, good.a))]
+    tau = np.concatenate([good.tau[:1] + np.array([[0.0, 3.0]]) * np.ones((50, 1)), good.tau])
+    still = identify.Log(np.arange(350) * good.t[1], *held, tau)
+    with pytest.warns(identify.LogWarning, match="log 1: ._joint stands still for the first 1 s"):
+        identify.fit_robot(model, still, **given)
 
 
 def test_an_error_at_rest_is_named():
