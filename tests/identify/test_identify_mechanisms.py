@@ -11,7 +11,7 @@ import jaxdyn as jd
 from jaxdyn.cli import main
 from jaxdyn.constraints.base import position_residual
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.identify.applied_fits import fit_mechanism
+from jaxdyn.identify.linear_fit import fit_mechanism
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.result import Segments, simulate_segment
 
