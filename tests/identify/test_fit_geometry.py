@@ -160,8 +160,7 @@ def test_standard_deviations_are_those_of_the_scatter():
     model, q = arm("rr"), np.random.default_rng(0).uniform(-1.5, 1.5, (15, 2))
     rng, exact = np.random.default_rng(1), tips(model, q)
     fits = [
-        identify.fit_geometry(model, q, exact @ motion(1e-4 * rng.normal(size=(15, 6))), frame="tip")
-        for _ in range(60)
+        identify.fit_geometry(model, q, exact @ motion(1e-4 * rng.normal(size=(15, 6))), frame="tip") for _ in range(60)
     ]
     # The true base is the identity and the others are zero, so that all values are errors. A value without noise has none.
     z = np.stack([(fit.values / fit.std)[fits[0].std > 1e-9] for fit in fits])
