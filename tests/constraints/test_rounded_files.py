@@ -200,7 +200,7 @@ def test_a_four_bar_with_few_digits_moves_as_with_all(tmp_path, exact, kind, dig
     assert np.abs(kept * np.asarray(phi)).max() < 1e-12
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_traced_start_drops_the_same_rows(tmp_path):
     path = WRITERS["sdf"](tmp_path / "bars", 5, TILT)
     _, motion, start, scene = crank_angles(path)

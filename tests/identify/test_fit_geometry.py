@@ -57,7 +57,9 @@ def measured():
     return arm(), true, q, DEVICE @ tips(true, q)
 
 
-@pytest.mark.parametrize("kinds", ["rrrrrr", "rrprrr", "rprp", "r"])
+@pytest.mark.parametrize(
+    "kinds", ["rrprrr", "r", *(pytest.param(x, marks=pytest.mark.slow) for x in ("rrrrrr", "rprp"))]
+)
 def test_rank_is_that_of_theory(kinds):
     """Mooring, Roth & Driels (1991): 4 R + 2 P + 6, by elimination in closed form and by singular values of the errors."""
     model = arm(kinds)

@@ -259,7 +259,7 @@ def test_cotangents_of_a_failed_run_are_nan(name):
     assert np.isfinite(slopes[::2]).all() and np.all(np.abs(slopes[::2, 1]) > 0.1)
 
 
-@pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("outer", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_second_derivatives_of_a_failed_run_are_nan(outer):
     """As the first ones, and not zero, which the derivative of a constant NaN would be; a loss that leaves it out has its own."""
     model, (q, v) = jd.scenes.double_pendulum(), jd.scenes.double_pendulum.start()[:2]

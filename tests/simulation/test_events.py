@@ -95,7 +95,7 @@ def test_steps_of_fixed_length_have_gradients_through_events():
         assert abs(float(got) - float(up - down) / (2 * h)) < 1e-5 * max(1.0, abs(float(got)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_steps_of_fixed_length_that_are_too_long_say_so():
     spring = jd.forces.JointSpring(jnp.asarray([400.0]), jnp.asarray([0.0]))
     scene = jd.Scene(block().system, forces=(*block().forces, spring))
@@ -501,7 +501,7 @@ def test_modes_that_flip_without_end_are_not_found(monkeypatch):
     assert bool(unsettled) and not bool(paradox) and code is jd.RESULTS.no_contact_mode
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_constraints_are_closed_at_coarse_tolerances_too():
     """A rod that turns by a radian a step under friction: save points are on the circle, or the steps have a code."""
     rod_scene = jd.scenes.pendulum_in_plane()

@@ -457,7 +457,7 @@ def test_what_succeeds_is_right(name):
     assert codes["RK4, 1 ms"] == BY_RK4[name]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rodas_serves_at_every_stiffness():
     """Springs of 1e2 to 1e9 N/m in one program: positions and their derivatives against closed forms."""
     case = cases()["flexible_joint"]
