@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import body_jacobian
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, warn
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, check_shapes, warn
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.topology import SCREW_KINDS
 from jaxdyn.model.tree import Model
@@ -80,10 +80,10 @@ class Actuators(eqx.Module):
     def __call__(
         self,
         system: Model,
-        q: Float[Array, " nq"],
-        v: Float[Array, " nv"],
-        control: Float[Array, " nu"],
-        activation: Float[Array, " na"] | None = None,
+        q: Numbers,
+        v: Numbers,
+        control: Numbers,
+        activation: Numbers | None = None,
     ) -> Float[Array, " nv"]:
         """Generalised force (nv,) in N m or N of the controls (nu,), in the order of `names`.
 
@@ -92,17 +92,17 @@ class Actuators(eqx.Module):
         **Raises:** ValueError for controls or activations of another shape.
         """
         force, rows = self._forces(system, q, v, control, activation)
-        low, high = self.effort_range.astype(q.dtype).T
+        low, high = self.effort_range.astype(rows.dtype).T
         # MuJoCo's order: clip the control, then each force, then the sum at each coordinate.
         return jnp.clip(force @ rows, low, high)
 
     def thrusts(
         self,
         system: Model,
-        q: Float[Array, " nq"],
-        v: Float[Array, " nv"],
-        control: Float[Array, " nu"],
-        activation: Float[Array, " na"] | None = None,
+        q: Numbers,
+        v: Numbers,
+        control: Numbers,
+        activation: Numbers | None = None,
     ) -> dict[str, Float[Array, "6"]]:
         """Wrenches (f, tau) (6,) of the actuators at sites by the sites' names, at their origins and in their axes, N and N m.
 
@@ -114,11 +114,12 @@ class Actuators(eqx.Module):
         result: dict[str, Array] = {}
         for i, site in enumerate(self.sites):
             if site is not None:
-                result[site] = result.get(site, 0.0) + force[i] * self.wrenches[i].astype(q.dtype)
+                result[site] = result.get(site, 0.0) + force[i] * self.wrenches[i].astype(force.dtype)
         return result
 
     def _forces(self, system: Model, q, v, control, activation) -> tuple[Array, Array]:
         """Force of each actuator (nu,), and the rows (nu, nv) along which they act."""
+        q, v = check_shapes(system, q=q, v=v)
         control = self._clip(control, q.dtype)
         if self._active:
             low, high = jnp.asarray(self.activation_range, q.dtype).T
@@ -140,12 +141,14 @@ class Actuators(eqx.Module):
         force = jnp.sum(gain * state, 1) * control + jnp.sum(bias * state, 1)
         return jnp.clip(force, limits[:, 0], limits[:, 1]), rows
 
-    def activation_rate(self, control: Float[Array, " nu"], activation: Float[Array, " na"]) -> Float[Array, " na"]:
+    def activation_rate(self, control: Numbers, activation: Numbers) -> Float[Array, " na"]:
         """Rate of the activations (na,), zero where it would lead out of their range.
 
         **Raises:** ValueError for controls or activations of another shape.
         """
-        activation = jnp.asarray(self._check_activation(activation), float)
+        # Of the dtype of the activation: a float32 model under x64 integrates float32.
+        activation = self._check_activation(activation)
+        activation = jnp.asarray(activation, activation.dtype if eqx.is_inexact_array(activation) else float)
         if not self._active:
             return activation
         wanted = self._clip(control, activation.dtype)[np.array(self._active, int)]
@@ -174,6 +177,7 @@ class Actuators(eqx.Module):
         return [i for i, kind in enumerate(self.dynamics) if kind is not None]
 
     def _clip(self, control, dtype) -> Array:
+        control = as_array(control, "control")
         if jnp.shape(control) != (len(self.names),):
             raise ValueError(
                 f"control has shape {jnp.shape(control)}, expected {(len(self.names),)}: one number for each of "
@@ -184,6 +188,7 @@ class Actuators(eqx.Module):
 
     def _check_activation(self, activation):
         names = [self.names[i] for i in self._active]
+        activation = activation if activation is None else as_array(activation, "activation")
         if activation is None or jnp.shape(activation) != (len(names),):
             shape = None if activation is None else jnp.shape(activation)
             raise ValueError(

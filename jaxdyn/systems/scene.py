@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.compile.known import is_concrete, is_tracing
-from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, batch_hint, check_state, check_system
 from jaxdyn.model.description import scene_lines
 
 if TYPE_CHECKING:
@@ -194,51 +194,54 @@ class Scene(eqx.Module):
         # Of the system, so that a scene made of a file's system and other constraints or forces keeps it.
         return getattr(self.system, "rounding", 0.0)
 
-    def applied_force(
-        self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0
-    ) -> Float[Array, " nv"] | None:
+    def applied_force(self, q: Numbers, v: Numbers, t: Number = 0.0) -> Float[Array, " nv"] | None:
         """Sum of the scene's forces (nv,) in N m or N, or None when it lists none.
 
-        **Raises:** ValueError that names a force whose result is not (nv,).
+        **Raises:** ValueError that names a force whose result is not (nv,), or an argument of another shape.
         """
         # None and not zeros: without forces nothing is added to tau, and nothing compiled for it.
         total = None
+        # Forces cast their numbers to the dtype of q, which would round them to integers at a q of integers.
+        state = at, _, _ = check_state(self.system, q=q, v=v, t=t)
         for i, force in enumerate(self.forces):
-            value = check_force(force(self.system, q, v, t), q, self.nv, f"forces[{i}]")
+            value = check_force(force(self.system, *state), at, self.nv, f"forces[{i}]")
             total = value if total is None else total + value
         return total
 
-    def clip_effort(self, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    def clip_effort(self, tau: Numbers) -> Float[Array, " nv"]:
         """Torques tau (nv,) clipped by the scene's `EffortLimits`."""
+        (clipped,) = check_state(self.system, tau=tau)
         for force in self.forces:
             cut = getattr(force, "clip_effort", None)
             # Limits act on the command in the order of the list, as in `drive_torque`.
-            tau = tau if cut is None else cut(self.system, tau)
-        return tau
+            clipped = clipped if cut is None else cut(self.system, clipped)
+        return clipped
 
-    def drive_state(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " n"] | None:
+    def drive_state(self, q: Numbers, v: Numbers, t: Number = 0.0) -> Float[Array, " n"] | None:
         """Start of the states of all `jd.forces.DriveDynamics` in the scene, one after the other (n,); None without any."""
-        states = [force.start(self.system, q, v, t) for force in self.forces if isinstance(force, DriveDynamics)]
+        state = check_state(self.system, q=q, v=v, t=t)
+        states = [force.start(self.system, *state) for force in self.forces if isinstance(force, DriveDynamics)]
         # None and not an empty array: scenes without drives integrate no state.
         return jnp.concatenate(states) if states else None
 
     def drive_torque(
         self,
-        q: Float[Array, " nq"],
-        v: Float[Array, " nv"],
+        q: Numbers,
+        v: Numbers,
         t: Number,
-        command: Float[Array, " nv"],
+        command: Numbers,
         state: Float[Array, " n"] | None = None,
     ) -> tuple[Float[Array, " nv"], Float[Array, " n"] | None]:
         """Torques (nv,) at the joints for the commands of a control, and the rates of the drives' states (None without any).
 
         The scene's drives and effort limits act in the order of `forces`; `state` as of `drive_state`.
         """
+        at, speed, time, torque = check_state(self.system, q=q, v=v, t=t, command=command)
         rates = []
         for force in self.forces:
-            command, rate, state = pass_command(force, self.system, q, v, t, command, state)
+            torque, rate, state = pass_command(force, self.system, at, speed, time, torque, state)
             rates += [] if rate is None else [rate]
-        return command, jnp.concatenate(rates) if rates else None
+        return torque, jnp.concatenate(rates) if rates else None
 
 
 # Velocity coordinates from which on a scene with constraints is compiled with its numbers. The program of given numbers has six

@@ -129,6 +129,24 @@ def test_defaults_of_the_model(arm):
     assert jd.Scene(arm).applied_force(q, v) is None
 
 
+@pytest.mark.parametrize("convert", [list, np.array, jnp.array])
+def test_integers_are_numbers(sliders, convert):
+    """A state of integers gives the forces of the same state of floats: fractions of coefficients are kept."""
+    forces = [
+        jd.forces.JointDamping(0.7, "coast"),
+        jd.forces.JointSpring(2.5, 0.25, "drive"),
+        jd.forces.EffortLimits(0.5),
+    ]
+    scene = jd.Scene(sliders, forces=forces)
+    q, v = convert([1, 2, 0, 0, 0, 0, 1, 0, 0, 0]), convert([3, 1, 0, 0, 0, 0, 0, 0, 0])
+    expected = [-0.7 * 3, -2.5 * (2 - 0.25)]
+    np.testing.assert_allclose(scene.applied_force(q, v, 1)[:2], expected, rtol=1e-15)
+    np.testing.assert_allclose(scene.clip_effort(v), np.clip(v, -0.5, 0.5), rtol=1e-15)
+    np.testing.assert_allclose(scene.drive_torque(q, v, 1, v)[0], np.clip(v, -0.5, 0.5), rtol=1e-15)
+    with pytest.raises(ValueError, match=r"v has shape \(2,\), expected \(9,\)"):
+        scene.applied_force(q, v[:2])
+
+
 def test_joints_are_taken_in_the_order_named(arm):
     q, v = sample(arm)
     coefficient = np.arange(1.0, 5.0)

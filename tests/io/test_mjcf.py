@@ -248,6 +248,39 @@ def test_controls_of_another_number_are_refused(mixed):
         scene.actuators.drive(lambda q, v, t: jnp.zeros(6), jnp.zeros(2))
 
 
+@pytest.mark.parametrize("convert", [list, np.array, jnp.array])
+def test_states_and_controls_of_integers_drive_as_in_mujoco(convert, tmp_path):
+    drives = """<motor joint="h" gear="0.7"/><position joint="h" kp="2.5" kv="0.3"/><motor site="s" gear="0 0 0.2 0.3 0.5 0"/>
+      <general joint="h" dyntype="filter" dynprm="0.3" gainprm="0.4"/>"""
+    file = tmp_path / "drives.xml"
+    file.write_text(f"""<mujoco><worldbody><body><joint name="h" axis="0 1 0"/>
+      <geom size="0.1" pos="0.3 0 0" contype="0" conaffinity="0"/><site name="s" pos="0.3 0 0"/></body></worldbody>
+      <actuator>{drives}</actuator></mujoco>""")
+    scene, oracle = jd.load(file), mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(oracle)
+    data.qpos[:], data.qvel[:], data.ctrl[:], data.act[:] = 2, 3, [1, 1, 2, 5], 1
+    mujoco.mj_forward(oracle, data)
+    q, v, control, activation = (convert([int(x) for x in y]) for y in (data.qpos, data.qvel, data.ctrl, data.act))
+    drive = scene.actuators
+    np.testing.assert_allclose(drive(scene.system, q, v, control, activation), data.qfrc_actuator, rtol=1e-14)
+    np.testing.assert_allclose(drive.activation_rate(control, activation), data.act_dot, rtol=1e-14)
+    np.testing.assert_allclose(drive.thrusts(scene.system, q, v, control, activation)["s"], [0, 0, 0.4, 0.6, 1, 0])
+
+
+def test_a_model_of_float32_integrates_activations_of_float32(tmp_path):
+    """An integrator under u = cos t, with x64 switched on."""
+    file = tmp_path / "rate.xml"
+    file.write_text("""<mujoco><worldbody><body><joint name="h"/>
+      <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body></worldbody>
+      <actuator><general joint="h" dyntype="integrator"/></actuator></mujoco>""")
+    scene = jd.load(file, dtype=jnp.float32)
+    driven = jd.Scene(scene.system, forces=[scene.actuators.drive(lambda q, v, t: jnp.cos(t)[None], [0.5])])
+    motion = jd.simulate(driven, [0.0], [0.0], [0.0, 1.0], outputs=("drive_state",))
+    assert motion.drive_state.dtype == motion.q.dtype == jnp.float32
+    np.testing.assert_allclose(motion.drive_state[-1], 0.5 + np.sin(1.0), rtol=1e-5)
+    np.testing.assert_allclose(motion.q[-1], 1.25 - np.sin(1.0), rtol=1e-4)
+
+
 DYNAMICS = """<general name="f" joint="h" dyntype="{0}" dynprm="0.08" gear="3" gainprm="2" ctrlrange="-1 1"/>
   <general name="servo" joint="h" dyntype="{0}" dynprm="0.05" gainprm="15" biastype="affine" biasprm="0 -15 -1.5"/>
   <intvelocity name="rate" joint="k" kp="6" kv="0.5" actrange="-0.3 0.3"/>
