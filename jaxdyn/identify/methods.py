@@ -1,4 +1,4 @@
-"""Methods of minimisation by one protocol (`descent.Method`): Gauss-Newton here, those of optimistix and optax step by step.
+"""Methods of minimisation by one protocol (`descent.Method`): Gauss-Newton here, those of optax step by step.
 
 Gauss-Newton steps minimise a sum of squared errors of log segments. The unknowns are y (p,) and, where initial states are free
 too, one vector for each segment. The errors of a segment depend on y and on its own initial state alone. Initial states are
@@ -17,7 +17,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.codes import RESULTS
@@ -202,59 +201,20 @@ if TYPE_CHECKING:
 else:
     Optimizer = Any  # optax is imported when a fit runs
 
-SOLVERS, METHODS = ("levenberg-marquardt", "dogleg"), ("lbfgs", "adam")
+METHODS = ("lbfgs", "adam")
 # Damping, in shares of the largest curvature, with which the decrease that a step promises is judged at the end of a fit.
 _CLEAR = 1e-6
 # Steps without a lower loss after which only rounding is left to remove.
 _STALE = 10
 # Random changes that a step tries.
 _CHANGES = 16
-_OPTIONS = {"jac": "fwd"}
 
 
 @contextlib.contextmanager
 def loose_promotion():
-    """Context in which dtypes and ranks are promoted, as optimistix and optax expect."""
+    """Context in which dtypes and ranks are promoted, as optax expects."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
-
-
-class LeastSquaresSteps(Method):
-    """Levenberg-Marquardt or dogleg steps for the sum of squares of `errors(z, args)`; Jacobians by forward mode.
-
-    It ends where a step changes unknowns and loss by less than `tolerance` of them. The state of an iterate is the solver's.
-    """
-
-    def __init__(self, errors: Callable, args, name: str, tolerance: float):
-        kind = optx.LevenbergMarquardt if name == SOLVERS[0] else optx.Dogleg
-        # A tolerance below rounding of float64 may never be met.
-        self.solver = kind(rtol=max(tolerance, 1e-14), atol=max(tolerance, 1e-14))
-        self.errors, self.args = errors, args
-
-    def init(self, start, kept):
-        """Start the solver, or restore its state."""
-        with loose_promotion():
-            state = _init_solver(self.errors, self.solver, start, self.args)
-            return self._iterate(start, state if kept is None else restore_leaves(kept, "solver", state))
-
-    def step(self, iterate, history, best):
-        """Make one step, which need not be accepted: the point then stays and the solver's state changes."""
-        if len(history) > _STALE and min(history[-_STALE:]) >= min(history[:-_STALE]):
-            return iterate, RESULTS.successful
-        with loose_promotion():
-            y, state, done, has_failed = _step_solver(self.errors, self.solver, iterate.point, self.args, iterate.state)
-            following = self._iterate(y, state)
-        if bool(has_failed):
-            return following, RESULTS.nonfinite
-        return following, RESULTS.successful if bool(done) else None
-
-    def arrays(self, iterate):
-        """Array leaves of the solver's state."""
-        return array_leaves("solver", iterate.state)
-
-    def _iterate(self, y, state) -> Iterate:
-        loss = float(_sum_of_squares(self.errors, y, self.args))
-        return Iterate(y, loss, state, bool(np.isfinite(loss)))
 
 
 class GradientSteps(Method):
@@ -406,26 +366,3 @@ def _update(optimizer, loss, args, is_searching: bool, y, state: _Descent):
         value, gradient = (optax.tree_utils.tree_get(own, name) for name in ("value", "grad"))
         state = state._replace(value=value / factor, gradient=jax.tree.map(lambda x: x / factor, gradient))
     return optax.apply_updates(y, change), state
-
-
-@eqx.filter_jit
-def _sum_of_squares(errors, y, args):
-    return jnp.sum(errors(y, args) ** 2)
-
-
-def _with_aux(errors):
-    return lambda z, args: (errors(z, args), None)
-
-
-@eqx.filter_jit
-def _init_solver(errors, solver, y, args):
-    shape = jax.eval_shape(lambda: errors(y, args))
-    return solver.init(_with_aux(errors), y, args, _OPTIONS, shape, None, frozenset())
-
-
-@eqx.filter_jit
-def _step_solver(errors, solver, y, args, state):
-    fn = _with_aux(errors)
-    y, state, _ = solver.step(fn, y, args, _OPTIONS, state, frozenset())
-    done, result = solver.terminate(fn, y, args, _OPTIONS, state, frozenset())
-    return y, state, done, result != optx.RESULTS.successful

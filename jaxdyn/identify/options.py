@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.identify.mechanisms import Measured
-from jaxdyn.identify.methods import METHODS, SOLVERS, Optimizer
+from jaxdyn.identify.methods import METHODS, Optimizer
 from jaxdyn.identify.result import (
     HOLDS,
     INITIAL,
@@ -275,6 +275,14 @@ def _integral(rate, t):
 GAUSS_NEWTON = "gauss-newton"
 
 
+def _method(method):
+    """The method; former names of other damped Gauss-Newton steps are deprecated."""
+    if isinstance(method, str) and method in ("levenberg-marquardt", "dogleg"):
+        warn(f'Solver("{method}") is deprecated and takes the steps of "{GAUSS_NEWTON}"', DeprecationWarning)
+        return GAUSS_NEWTON
+    return method
+
+
 class Solver(eqx.Module):
     """Method of minimisation of `fit_parameters`.
 
@@ -283,8 +291,7 @@ class Solver(eqx.Module):
     - `method`: "gauss-newton" for up to some hundred numbers: damped Gauss-Newton steps with exact Jacobians by forward mode,
       which eliminate free initial states segment by segment, until the next one predicts a decrease of the loss by less than
       `tolerance` of it. Torques that are linear in feasible inertias and other numbers take the interior-point steps of
-      `fit_torques` first. "levenberg-marquardt" and "dogleg" are those of optimistix, with the same Jacobians. For more numbers,
-      as of a network, "lbfgs", "adam" or an optax.GradientTransformation, by reverse mode.
+      `fit_torques` first. For more numbers, as of a network, "lbfgs", "adam" or an optax.GradientTransformation, by reverse mode.
     - `steps`: the most steps. `learning_rate`: of adam, a share of each number (of one where it starts at zero), decaying to zero
       along a cosine. `tolerance`: "lbfgs" ends where ten steps have lowered the loss by less than this share of it.
     - `starts`: number of starting points around the given one. All are improved in one `jax.vmap`, and the best is fitted to the
@@ -299,7 +306,7 @@ class Solver(eqx.Module):
     ```
     """
 
-    method: Checked[str | Optimizer] = GAUSS_NEWTON
+    method: Checked[str | Optimizer] = eqx.field(default=GAUSS_NEWTON, converter=_method)
     steps: int = 200
     learning_rate: float = 0.1
     tolerance: float = 1e-9
@@ -308,7 +315,7 @@ class Solver(eqx.Module):
     seed: int = 0
 
     def __check_init__(self):
-        methods = (GAUSS_NEWTON, *SOLVERS, *METHODS)
+        methods = (GAUSS_NEWTON, *METHODS)
         if isinstance(self.method, str) and self.method not in methods:
             raise ValueError(f"method is {self.method!r}; give one of {methods} or an optax.GradientTransformation")
         if not (isinstance(self.method, str) or (hasattr(self.method, "init") and hasattr(self.method, "update"))):

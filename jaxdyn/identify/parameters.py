@@ -18,10 +18,8 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.identify.mechanisms import FitSystem
 from jaxdyn.identify.methods import (
     DAMPING,
-    SOLVERS,
     GaussNewton,
     GradientSteps,
-    LeastSquaresSteps,
     LinearErrors,
     Unknowns,
     confirm_minimum,
@@ -189,11 +187,6 @@ def _minimise(
         if minimum is None or linear is not known:
             minimum = Minimum.of(problem, logs, linear)
         return Descent(end.last, end.last, history, result), minimum
-    if solver.name in SOLVERS:
-        end = descend(LeastSquaresSteps(errors_of, problem, solver.name, solver.tolerance), unknowns, watch)
-        linear = linearise(problem, end.best.point)
-        result = confirm_minimum(end.result, linear, solver.tolerance, rounding)
-        return end._replace(result=result), Minimum.of(problem, logs, linear)
     steps = GradientSteps(
         loss_of,
         problem,

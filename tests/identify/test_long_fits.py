@@ -96,7 +96,7 @@ def _steps(path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "lbfgs"])
+@pytest.mark.parametrize("method", ["gauss-newton", "lbfgs"])
 def test_a_stopped_fit_resumes_to_the_same_numbers(tmp_path, method):
     path = tmp_path / "fit.ckpt"
     start = dict(method=method, start=(0.2, 2.6, 0.9), steps=12)
@@ -141,7 +141,7 @@ def test_solvers_agree_and_progress_is_shown(capsys):
     log, linear = recorded(), lambda system: [system.parameters["size"]]
     rows = np.sin(3.0 * log.t + 0.3)
     want = rows @ (log.a + log.tau * -1)[:, 0] / (rows @ rows)
-    for method in ("gauss-newton", "levenberg-marquardt", "dogleg", "lbfgs"):
+    for method in ("gauss-newton", "lbfgs"):
         fit = jd.identify.fit_parameters(
             system(size=0.4),
             log,
