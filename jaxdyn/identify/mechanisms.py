@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.constraints.assembly import Assembly, assemble
-from jaxdyn.constraints.base import layout, position_residual, rows, velocity_residual
+from jaxdyn.constraints.base import layout, position_residual, rows
 from jaxdyn.constraints.codes import CODES, RESULTS, code_of
 from jaxdyn.constraints.selection import degrees_of_freedom, independent_rows
 from jaxdyn.dynamics import quantities as dynamics
@@ -364,22 +364,18 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
     guess = jnp.asarray(as_array(guess, "guess", dtype))
     if guess.shape != (system.nq,):
         raise ValueError(f"guess has shape {guess.shape}, expected {(system.nq,)} = (nq,)")
-    # No more measured joints than degrees of freedom: `assemble` can hold all of them at their measured positions.
-    can_hold = isinstance(system, Model) and len(names) <= degrees_of_freedom(scene, guess)
+    # No more measured joints than degrees of freedom contradict no row, unless they do not determine the state.
+    is_exact = isinstance(system, Model) and len(names) <= degrees_of_freedom(scene, guess)
 
     def complete_sample(previous, sample):
         position, velocity, time = sample
         start = previous.at[np.array(q_indices)].set(position)
         v = jnp.zeros((system.nv,), dtype).at[np.array(columns)].set(velocity)
-        if not can_hold:
-            nearest = on_constraints(scene, start, v, time, columns)
-            return nearest.q, (nearest.q, nearest.v, nearest.result)
-        held = assemble(scene, start, None, time, hold={name: position[i] for i, name in enumerate(names)}, throw=False)
-        v, has_velocity = nearest_velocity(scene, held.q, v, time, columns)
-        # As many measured joints as degrees of freedom contradict no row, unless they do not determine the velocity.
-        left = velocity_residual(independent_rows(scene, held.q, time), held.q, v, time)
-        missed = held.success & ~(has_velocity & _is_small(left, v))
-        return held.q, (held.q, v, RESULTS.where(missed, RESULTS.not_nearest, held.result))
+        found = on_constraints(scene, start, v, time, columns)
+        holds = _is_small(found.q[np.array(q_indices)] - position, position)
+        holds &= _is_small(found.v[np.array(columns)] - velocity, velocity)
+        missed = found.success & is_exact & ~holds
+        return found.q, (found.q, found.v, RESULTS.where(missed, RESULTS.not_nearest, found.result))
 
     # In sequence: every sample starts from the one before, which keeps the mechanism on one branch of its assembly.
     _, (q, v, result) = jax.jit(lambda *samples: lax.scan(complete_sample, guess, samples))(
