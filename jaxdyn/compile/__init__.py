@@ -23,7 +23,6 @@ from jaxdyn.compile.jacobi import inverse as inverse
 from jaxdyn.compile.jacobi import pseudo_inverse_by_pivots as pseudo_inverse_by_pivots
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
 from jaxdyn.compile.kernels import kernel as kernel
-from jaxdyn.compile.kernels import variant as variant
 from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.mode import is_standalone as is_standalone

@@ -77,8 +77,7 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
     if goes_on(state) is True:
         state, most = step(state), most - 1
     if not has_branches() and (marks or not is_standalone()) and not is_careful():
-        flag = goes_on(state)
-        return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, state)
+        return _mark(goes_on(state), state)
     if has_branches() and most > MOST_WRITTEN_OUT:
         return _loop(goes_on, step, state, most)
     for _ in range(most):
@@ -88,6 +87,21 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
         else:
             state = jax.tree.map(lambda new, old, flag=flag: jnp.where(flag, new, old), step(state), state)
     return state
+
+
+def rarely(flag, change: Callable[[T], T], state: T) -> T:
+    """change(state) where the flag () is set, which few samples are.
+
+    A kernel marks them as not valid. The program that computes them again, and what runs without a kernel, have the branch.
+    """
+    if is_expanding() and not is_careful():
+        return _mark(flag, state)
+    changed = cond(flag, lambda: change(state), lambda: state)
+    return jax.tree.map(lambda new, old: jnp.where(flag, new, old), changed, state)
+
+
+def _mark(flag, state: T) -> T:
+    return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, state)
 
 
 def _loop(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, most: int) -> T:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile.kernels import variant
+from jaxdyn.compile import mode
 from jaxdyn.compile.matrix_loops import LoopWriter, MatrixProgram
 from jaxdyn.compile.pivots import eliminate
 from jaxdyn.compile.rules import mark_invalid
@@ -243,7 +243,11 @@ def _gram_eigenvectors_jvp(primals, tangents):
 @jax.custom_jvp
 def inverse(matrix: jax.Array) -> jax.Array:
     """The inverse (n, n) of a regular matrix by elimination; numbers that are not finite where it is singular."""
-    return matrix if 0 in matrix.shape else _regular_inverse(matrix)
+    if 0 in matrix.shape:
+        return matrix
+    if mode.is_expanding() and not mode.is_careful():
+        return _inverse_without_exchange(matrix)
+    return _inverse(matrix.shape[0], matrix.dtype)(matrix)
 
 
 @inverse.defjvp
@@ -263,11 +267,6 @@ def _inverse_without_exchange(matrix):
     off = jnp.matmul(result, jnp.matmul(matrix, factor, precision="highest"), precision="highest") - factor
     is_good = jnp.all(jnp.abs(pivots) > _LEAST_SHARE * sizes) & jnp.all(jnp.abs(off) < _LEAST_SHARE)
     return mark_invalid(~is_good, result)
-
-
-@variant(_inverse_without_exchange, marks=True)
-def _regular_inverse(matrix):
-    return _inverse(matrix.shape[0], matrix.dtype)(matrix)
 
 
 def _orthogonalise(w: LoopWriter, matrix, n: int, m: int, of_vector: int, of_entry: int):

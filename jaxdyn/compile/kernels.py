@@ -34,6 +34,7 @@ def kernel(
     static: int = 0,
     fallback: Callable | None = None,
     derivative: Callable | str | bool | None = None,
+    alone: bool = True,
 ) -> Any:
     """Compute a function of one sample by a native kernel; a decorator.
 
@@ -51,11 +52,13 @@ def kernel(
       stays a program of its own, with the derivative of its numbers, inside another kernel too; or a rule
       `derivative(*static, tree, *args, steps)` that returns the change of the results for the `steps` of the leaves of tree and
       args (None for a leaf that does not change), where that is cheaper.
+    - `alone`: whether the function is a kernel by itself. If not, it is only inlined in others, and elsewhere the fallback is
+      called: for functions that share numbers with what is around them, and that alone are too large to be written out.
 
     **Raises:** whatever the function raises while it is traced.
     """
     if function is None:
-        return functools.partial(kernel, static=static, fallback=fallback, derivative=derivative)
+        return functools.partial(kernel, static=static, fallback=fallback, derivative=derivative, alone=alone)
     rule = derivative if callable(derivative) else None
 
     @functools.wraps(function)
@@ -69,6 +72,8 @@ def kernel(
             return function(*args) if results is None else results
         if mode.is_expanding():
             return inline_call(function, *given, fallback)
+        if not alone and fallback is not None:
+            return fallback(*args)
         # Derivatives of a subprogram's call would be those of its numbers, written out: calls pay where nobody differentiates.
         results = _by_kernel(function, *given, fallback, tangent=rule, calls=derivative is False)
         return (function if fallback is None else fallback)(*args) if results is None else results
@@ -140,25 +145,6 @@ def call_program(program, leaves) -> list:
 @functools.lru_cache(maxsize=1024)
 def _jit_call(program):
     return jax.jit(lambda *leaves: call_program(program, leaves))
-
-
-def variant(inside: Callable, *, marks: bool = False) -> Any:
-    """Choose between two functions that compute the same; a decorator of the one for JAX.
-
-    **Arguments:** `inside` is traced in its place inside of kernels, as it stands. A program of numbers profits from every known
-    zero, and JAX from few operations on large arrays. `marks`: whether `inside` may mark samples as not valid; a
-    fallback that is a program itself, as in code without JAX, then takes the decorated function.
-    """
-
-    def decorate(outside: Callable) -> Callable:
-        @functools.wraps(outside)
-        def call(*args):
-            is_inside = mode.is_expanding() and not (marks and mode.is_careful())
-            return (inside if is_inside else outside)(*args)
-
-        return call
-
-    return decorate
 
 
 # --- native loops: a program that is repeated for a sample until it has ended, with rows written on the way ---

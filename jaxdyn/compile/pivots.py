@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxdyn.compile import mode
+from jaxdyn.compile.kernels import kernel
 from jaxdyn.compile.matrix_loops import LoopWriter, MatrixProgram
 
 with contextlib.suppress(ImportError):  # no kernels without llvmlite
@@ -17,6 +19,9 @@ from jax.scipy.linalg import solve_triangular
 
 # Unknowns up to which an elimination is written out.
 _MOST_WRITTEN_OUT = 24
+# Rows of a matrix up to which its Cholesky factor is written out, with several samples in a vector: operations grow as the cube.
+# Loops over its rows are as fast from 40 rows on, and compile in a tenth of the time.
+_MOST_FACTORED = 32
 # Rows whose distances differ by less than this part are equally far.
 _ALIKE = 1e-3
 
@@ -209,7 +214,10 @@ def _clear_column(least: float, state, _):
     return (rest, jnp.concatenate([right[1:] - matrix[1:, :1] * value, value])), pivot
 
 
-# --- Cholesky factors and triangular solutions by loops over rows of vectors, for matrices of any size ---
+# --- Cholesky factors and triangular solutions ---
+#
+# Inside of a kernel they are written in their place, where the zeros of the matrix are known. By themselves they are kernels, and
+# where the matrix is large, loops over rows of vectors.
 
 
 class CholeskyFactor(MatrixProgram):
@@ -301,16 +309,27 @@ _cholesky_factor, _triangular_solution = (
 )
 
 
-@jax.custom_jvp
 def cholesky_factor(matrix: jax.Array) -> jax.Array:
-    """The lower triangular L (n, n) with L L^T = matrix, of which the lower triangle is read."""
+    """The lower triangular L (n, n) with L L^T = matrix, of which the lower triangle is read; NaN where it is not definite."""
+    if mode.is_expanding():
+        return _factor(None, matrix)
+    return kernel(_factor)(None, matrix) if len(matrix) <= _MOST_FACTORED else _factor_by_loops(matrix)
+
+
+def _factor(_, matrix):
+    # Without symmetrisation derivatives and operations are those of the lower triangle alone.
+    return lax.linalg.cholesky(matrix, symmetrize_input=False)
+
+
+@jax.custom_jvp
+def _factor_by_loops(matrix):
     return _cholesky_factor(matrix.shape[0], matrix.dtype)(matrix)
 
 
-@cholesky_factor.defjvp
-def _cholesky_factor_jvp(primals, tangents):
+@_factor_by_loops.defjvp
+def _factor_by_loops_jvp(primals, tangents):
     # dL = L phi(L^-1 dA L^-T), with phi the lower triangle with half of its diagonal.
-    L, change = cholesky_factor(primals[0]), jnp.tril(tangents[0])
+    L, change = _factor_by_loops(primals[0]), jnp.tril(tangents[0])
     change = change + jnp.tril(change, -1).T
     inner = triangular_solution(L, triangular_solution(L, change).T)
     half = jnp.tril(inner) - 0.5 * jnp.diag(jnp.diagonal(inner))
@@ -318,8 +337,22 @@ def _cholesky_factor_jvp(primals, tangents):
 
 
 def triangular_solution(factor: jax.Array, right: jax.Array, transposed: bool = False) -> jax.Array:
-    """L^-1 right (n, k), or L^-T right, for a lower triangular L (n, n)."""
+    """L^-1 right (n, ...), or L^-T right, for a lower triangular L (n, n)."""
+    if mode.is_expanding():
+        return _solve(transposed, None, factor, right)
+    is_large = max(factor.size, right.size) > _MOST_FACTORED**2
+    return (
+        _solve_by_loops(factor, right, transposed)
+        if is_large
+        else kernel(_solve, static=1)(transposed, None, factor, right)
+    )
 
+
+def _solve(transposed: bool, _, factor, right):
+    return solve_triangular(factor, right, lower=True, trans=int(transposed))
+
+
+def _solve_by_loops(factor, right, transposed: bool):
     def solve(factor, right, transposed):
         columns = right.reshape(len(right), -1)
         program = _triangular_solution(*columns.shape, columns.dtype, transposed)

@@ -15,13 +15,11 @@ gamma = -dw/dt.
 
 from collections.abc import Callable, Hashable, Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import variant
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout
 from jaxdyn.dynamics.kinematics import BodyFrames, body_frames
 from jaxdyn.dynamics.tree_frames import take
@@ -129,14 +127,14 @@ class Pair(Constraint):
     @classmethod
     def group_positions(cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], t: Number) -> list:
         """Residuals (nh,) of each constraint, None without one."""
-        return _positions(tuple(members), system, q)
+        return _group_positions(tuple(members), system, q)
 
     @classmethod
     def group_rows(
         cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> list:
         """A (r, nv), gamma (r,) and velocity (r,) of each constraint."""
-        return _motions(tuple(members), system, q, v)
+        return _group_rows(tuple(members), system, q, v)
 
 
 def _group_positions(members: tuple[Pair, ...], system, q) -> list:
@@ -187,12 +185,6 @@ def _masked_columns(left, subspace, mask: np.ndarray):
     product = product * jnp.asarray(np.take_along_axis(mask, index, 1)[:, None, :], left.dtype)
     rows, zero = np.ogrid[: left.shape[0], : left.shape[1], :1], jnp.zeros((*left.shape[:2], len(subspace)), left.dtype)
     return zero.at[rows[0], rows[1], index[:, None, :]].set(product)
-
-
-# Traced once for all calls of a program: a step with projections has many of them. Not in kernels, where a nested `jit` would
-# hide which numbers are constants.
-_positions = variant(_group_positions)(eqx.filter_jit(_group_positions))
-_motions = variant(_group_rows)(eqx.filter_jit(_group_rows))
 
 
 def relative_poses(members, system, q):

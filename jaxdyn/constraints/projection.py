@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import batch, implicit, kernel, mark_invalid, value_and_jvp, variant
+from jaxdyn.compile import batch, implicit, kernel, mark_invalid, value_and_jvp
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whiten_rows
 from jaxdyn.constraints.rank import (
@@ -51,8 +51,9 @@ def project_state(scene: Scene, q, v, t, rank_tol: float | None = None):
 
 
 def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | None = None) -> Any:
-    """`project_state` at the end of a step with estimated errors of q, and of v, each (nv,): (q, v, errors).
+    """`project_state` at the end of a step with estimated errors of q, and of v, each (nv,): (q, v, errors, is_poor).
 
+    `is_poor`: one where another choice of rows may be independent, as these are nearly dependent (`renew_rows`), else zero.
     Errors are returned without their components normal to the constraints, which the projection removes from q and v to first
     order. Near a singular position these are large, and shorter steps do not make them smaller: the step size would collapse. The
     residual that the projection leaves is added.
@@ -61,10 +62,10 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     def project(scene, q, v, t, *errors):
         q = retract(scene.system, q)
         if layout(scene)[-1].end > scene.nv and not has_selection(scene):
-            return _by_rank(rank_tol, scene, q, v, t, errors)
+            return *_by_rank(rank_tol, scene, q, v, t, errors), jnp.zeros((), q.dtype)
         by_kernel = kernel(_by_pivots, static=1, fallback=_by_rank_in_full, derivative=False)
         *state, is_poor = _in_rounds(lambda q, v: by_kernel(rank_tol, scene, q, v, t, errors), q, v, errors)
-        return _mark(is_poor, tuple(state)) if has_selection(scene) else tuple(state)
+        return *state, jnp.asarray(is_poor).astype(q.dtype)
 
     def tangent(scene, q, v, t, *rest):
         *errors, steps = rest
@@ -87,12 +88,6 @@ def _in_rounds(again: Callable, q, v, errors):
     """
     start = q, v, errors, False, True
     return batch.repeat_while(lambda state: state[4], lambda state: tuple(again(*state[:2])), start, _MOST_ROUNDS)[:4]
-
-
-# Marks a state that was projected by rows which another choice may replace (`renew_rows`), in a kernel alone.
-@variant(lambda flag, state: jax.tree.map(partial(mark_invalid, flag), state), marks=True)
-def _mark(flag, state):
-    return state
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
@@ -244,7 +239,7 @@ def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):
             (of_place, partial(matmul, A[on.holonomic]), state.q_distance),
             (partial(on.shortest, on.every), partial(matmul, A), state.v_distance),
         )
-    return state.q, state.v, lax.stop_gradient(errors)
+    return state.q, state.v, lax.stop_gradient(errors), jnp.zeros((), q.dtype)
 
 
 # Derivatives of the projection onto the constraints, by the implicit function theorem.

@@ -1,7 +1,7 @@
 """Rank decisions, and pseudo-inverses of rows that may be dependent."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,6 @@ from jaxdyn.compile import (
     mark_invalid,
     pseudo_inverse_by_pivots,
     pseudo_inverse_by_rotations,
-    variant,
 )
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_static
@@ -115,7 +114,11 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = Fa
     """
     if Y.shape[1] > Y.shape[0]:
         return pseudo_inverse(Y.T, rank_tol, True).T
-    return _pseudo_inverse(rank_tol, dependent, None, Y)
+    # Gram matrix, factor, two triangular solves and two products: 8 n m^2 sums and products for Y (n, m).
+    is_short = 8 * Y.shape[0] * Y.shape[1] ** 2 <= _MAX_OPERATIONS
+    by_loops = _by_rotations if is_short or dependent else _by_pivots
+    by_kernel = kernel(_by_normal_equations, static=2, fallback=by_loops, derivative=False, alone=is_short)
+    return by_kernel(rank_tol, dependent, None, Y)
 
 
 class Columns(NamedTuple):
@@ -182,6 +185,10 @@ def _by_rotations(rank_tol, dependent, _, Y):
     return pseudo_inverse_by_rotations(Y, rank_tol)
 
 
+def _by_pivots(rank_tol, dependent, _, Y):
+    return pseudo_inverse_by_pivots(Y, rank_tol, least_pivot(Y, rank_tol))
+
+
 def _solve_normal_equations(rank_tol, dependent: bool, Y):
     """The pseudo-inverse (Y^T Y)^-1 Y^T, and whether it is doubtful, by the pivots of Y^T Y.
 
@@ -204,17 +211,6 @@ def _by_normal_equations(rank_tol, dependent: bool, _, Y):
     return mark_invalid(is_doubtful, inverse)
 
 
-@variant(_by_normal_equations, marks=True)
-def _pseudo_inverse(rank_tol, dependent: bool, _, Y):
-    # Gram matrix, factor, two triangular solves and two products: 8 n m^2 sums and products for Y (n, m).
-    if 8 * Y.shape[0] * Y.shape[1] ** 2 <= _MAX_OPERATIONS:
-        by_kernel = kernel(_by_normal_equations, static=2, fallback=_by_rotations, derivative=False)
-        return by_kernel(rank_tol, dependent, None, Y)
-    if dependent:
-        return _by_rotations(rank_tol, dependent, None, Y)
-    return pseudo_inverse_by_pivots(Y, rank_tol, least_pivot(Y, rank_tol))
-
-
 @pseudo_inverse.defjvp
 def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     (Y,), (dY,) = primals, tangents
@@ -229,34 +225,23 @@ def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
 
 
 class LeastSquares(NamedTuple):
-    """Minimum-norm solutions w of Y^T w = r, and their coefficients in the columns of Y."""
+    """Minimum-norm solutions w of Y^T w = r, and their coefficients in the columns of Y, by its pseudo-inverse."""
 
     Y: Array
-    factor: Any  # Cholesky factor of Y^T Y, in kernels; else None
-    inverse: Any  # pseudo-inverse of Y, elsewhere; else None
+    inverse: Array
 
     def shortest(self, right):
         """The shortest w with Y^T w = right."""
-        if self.factor is None:
-            return matmul(self.inverse.T, right)
-        return matmul(self.Y, solve_cholesky(self.factor, right))
+        return matmul(self.inverse.T, right)
 
     def multipliers(self, w):
         """The smallest x with Y x = w, for w that is a sum of columns."""
-        if self.factor is None:
-            return matmul(self.inverse, w)
-        return solve_cholesky(self.factor, matmul(self.Y.T, w))
+        return matmul(self.inverse, w)
 
 
-def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
-    factor = cholesky(regular_gram(Y))
-    return LeastSquares(Y, mark_invalid(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
-
-
-@variant(_least_squares_in_kernel, marks=True)
 def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
-    """Factor a matrix: its pseudo-inverse; in a kernel its Cholesky factor, with dependent columns marked as invalid."""
-    return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
+    """Factor a matrix."""
+    return LeastSquares(Y, pseudo_inverse(Y, rank_tol))
 
 
 def rank_of(A: Float[Array, "n m"], inverse: Float[Array, "m n"]) -> Float[Array, ""]:
@@ -265,7 +250,6 @@ def rank_of(A: Float[Array, "n m"], inverse: Float[Array, "m n"]) -> Float[Array
     return jnp.round(jnp.sum(inverse * A.T))
 
 
-@variant(lambda *_: jnp.asarray(True))  # programs of single numbers have no code to say it with
 def has_clear_rank(
     A: Float[Array, "n m"], inverse: Float[Array, "m n"], rank_tol: float | None, is_exact: bool = False
 ) -> Bool[Array, ""]:
@@ -274,7 +258,16 @@ def has_clear_rank(
     The least singular value that counts has to be `LEAST_GAP` times the largest that does not. Rows that leave no motion have to
     be independent beyond doubt: a row that differs from a combination of others by the rounding of its numbers leaves none, too.
     Those of functions, not of bodies whose geometry may have been typed with few digits, are taken as they stand: `is_exact`.
+    Kernels do not ask.
     """
+    return kernel(_take_as_clear, static=2, fallback=_has_gap, alone=False)(rank_tol, is_exact, None, A, inverse)
+
+
+def _take_as_clear(rank_tol, is_exact: bool, _, A, inverse):
+    return jnp.asarray(True)
+
+
+def _has_gap(rank_tol, is_exact: bool, _, A, inverse):
     (A, inverse), least = lax.stop_gradient((A, inverse)), tolerance(rank_tol, A)
     is_full = (rank_of(A, inverse) >= A.shape[1]) & (rank_tol is None and not is_exact and A.shape[0] >= A.shape[1])
 

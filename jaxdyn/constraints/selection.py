@@ -14,18 +14,15 @@ dependent (`renew_rows`).
 A dropped row stays in its place as a row of zeros (`Scene.kept_rows`): shapes, names and multipliers are those of the scene.
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxdyn.compile import Evaluation, entry_point, is_standalone, kernel, mark_invalid, variant
-from jaxdyn.compile.batch import cond
+from jaxdyn.compile import Evaluation, entry_point, kernel, mark_invalid
 from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.codes import RESULTS
@@ -125,7 +122,7 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
 
 def _held_selection(scene: Scene, q, t) -> Selection:
     """The choice that a scene of `choose_rows` holds, made again where it is poor."""
-    held, rows = scene.kept_rows, renew_rows(scene, q, t, False)
+    held, rows = scene.kept_rows, renew_rows(scene, q, t)
     gap = held.gap
     if scene.rounding:
         # In a singular position no choice is good, and rounding hides which rows are independent there.
@@ -147,13 +144,6 @@ def rank_code(scene: Scene, result: Any) -> Any:
     return RESULTS.where(is_clear, result, RESULTS.unclear_rank)
 
 
-def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Selection:
-    """All rows; invalid where some may repeat others, whose choice takes more than a kernel should hold."""
-    every = _every_row(scene, q.dtype)
-    is_doubtful = _has_doubtful_rows(_least_doubtless(q, rank_tol), scene.without_forces, q, t)
-    return every._replace(kept=mark_invalid(is_doubtful, jnp.asarray(every.kept)))
-
-
 def select_rows(scene: Scene, q, t: Numbers, rank_tol: float | None = None) -> Selection:
     """The independent rows of a mechanism at a configuration on its constraints; a constant.
 
@@ -162,11 +152,6 @@ def select_rows(scene: Scene, q, t: Numbers, rank_tol: float | None = None) -> S
     """
     if holds_rows(scene):
         return _held_selection(scene, q, t)
-    return _search_rows(scene, q, t, rank_tol)
-
-
-@variant(_select_in_kernel, marks=True)
-def _search_rows(scene: Scene, q, t: Numbers, rank_tol: float | None) -> Selection:
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
     if is_concrete(scene, q, t):
         place = np.asarray(q), np.asarray(t, q.dtype)
@@ -182,10 +167,7 @@ def _search_rows(scene: Scene, q, t: Numbers, rank_tol: float | None) -> Selecti
     every = _every_row(bare, q.dtype)
     if not every.kept.size:
         return every
-    t = jnp.asarray(t, q.dtype)
-    if is_standalone():  # a program without JAX has no branches
-        return _select(bare, q, t, rank_tol)
-    return _select_doubtful(rank_tol, bare, q, t)
+    return _select_in_kernel(rank_tol, bare, q, jnp.asarray(t, q.dtype))
 
 
 @once
@@ -198,8 +180,11 @@ def rows_and_doubts(scene: Scene, *, rank_tol: float | None, dtype) -> tuple[Sel
 
 
 @kernel(static=1, fallback=lambda rank_tol, scene, q, t: _select(scene, q, t, rank_tol))
-def _select_doubtful(rank_tol: float | None, scene: Scene, q, t) -> Selection:
-    return Selection(*map(jnp.asarray, _select_in_kernel(scene, q, t, rank_tol)))
+def _select_in_kernel(rank_tol: float | None, scene: Scene, q, t) -> Selection:
+    """All rows; invalid where some may repeat others, whose choice takes more than a kernel should hold."""
+    kept, *rest = map(jnp.asarray, _every_row(scene, q.dtype))
+    is_doubtful = _has_doubtful_rows(_least_doubtless(q, rank_tol), scene, q, t)
+    return Selection(mark_invalid(is_doubtful, kept), *rest)
 
 
 def _every_row(scene: Scene, dtype) -> Selection:
@@ -232,32 +217,25 @@ def _select(scene: Scene, q, t, rank_tol) -> Selection:
     return jax.tree.map(lambda x, y: jnp.where(is_finite, x, y), chosen, every)
 
 
-def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
+def renew_rows(scene: Scene, q, t) -> Float[Array, " n"]:
     """`rows_of` a scene for the next step, with the same number of rows; a constant.
 
     Rows are chosen anew where the kept ones have become nearly dependent. There are positions at which every fixed choice of rows
-    loses rank, though all rows together do not. A scalar program has no branches: it marks the sample as invalid there
-    (`project_step` does if the state `is_projected`), which another program then computes.
+    loses rank, though all rows together do not.
     """
-    old = rows_of(scene, q.dtype)
-    whole = all_rows(scene)
-    bare, q, t = stop_gradient((whole.without_forces, q, jnp.asarray(t, q.dtype)))
-    return _renew(bare, q, t, old, True) if is_projected else _checked_rows(bare, q, t, old)
+    bare, q, t = stop_gradient((all_rows(scene).without_forces, q, jnp.asarray(t, q.dtype)))
+    return _renew(bare, q, t, rows_of(scene, q.dtype))
 
 
-def _check_kept_rows(bare: Scene, q, t, old, is_projected: bool):
-    if is_projected:  # the projection has the factor of these rows anyway, and marks the sample
-        return old
-    kept, least = old[:-1], old[-1]
-    return mark_invalid(jnp.any(kept == 0) & ~(_pivot_of(bare, q, t, kept) > least), old)
+def are_rows_poor(scene: Scene, q, t) -> Bool[Array, ""]:
+    """Decide whether `renew_rows` chooses other rows; a constant."""
+    bare, q, t = stop_gradient((all_rows(scene).without_forces, q, jnp.asarray(t, q.dtype)))
+    return kernel(_are_poor)(bare, q, t, rows_of(scene, q.dtype))
 
 
-@variant(_check_kept_rows, marks=True)
-def _renew(bare: Scene, q, t, old, is_projected: bool):
-    del is_projected
-    is_poor = jnp.any(old[:-1] == 0) & ~(kernel(_pivot_of)(bare, q, t, old[:-1]) > old[-1])
-    again = partial(_choose_again, bare, q, t, old)
-    return again() if is_standalone() else cond(is_poor, again, lambda: old)
+def _are_poor(bare: Scene, q, t, rows):
+    kept, least = rows[:-1], rows[-1]
+    return jnp.any(kept == 0) & ~(_pivot_of(bare, q, t, kept) > least)
 
 
 def _choose_again(bare: Scene, q, t, old):
@@ -276,20 +254,8 @@ def _choose_again(bare: Scene, q, t, old):
 
 
 @kernel(fallback=_choose_again)
-def _checked_rows(bare: Scene, q, t, old):
-    return _check_kept_rows(bare, q, t, old, False)
-
-
-@variant(lambda old, new, project, state: state, marks=True)
-def project_after_exchange(old, new, project: Callable, state: Any) -> Any:
-    """project(state) where the rows `new` of the next step are not the `old` ones, else the state.
-
-    Rows of rounded numbers that were dropped are open by the rounding. The step after an exchange would close them, and take the
-    distance for its error, which no shorter step reduces. In a kernel rows are not exchanged (see `renew_rows`).
-    """
-    is_new = jnp.any(old != new)
-    moved = cond(is_new, lambda: project(state), lambda: state)
-    return jax.tree.map(lambda x, y: jnp.where(is_new, x, y), moved, state)
+def _renew(bare: Scene, q, t, old):
+    return mark_invalid(_are_poor(bare, q, t, old), old)
 
 
 def _pivot_of(scene: Scene, q, t, kept):

@@ -9,13 +9,13 @@ Every function raises a ValueError that names the argument when a shape does not
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import implicit, kernel, value_and_jvp, variant
+from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.dynamics import recursions, scans, tree_frames, world_frame
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.recursions import sweeps
@@ -39,9 +39,13 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
     if isinstance(model, System):
         return system_quantity("mass_matrix", model, *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
-    if _has_many_pairs(model):
+    pairs = int(model.topology.ancestors.sum())
+    if pairs > max(tree_frames.MAX_PAIRS, model.nb**2 // 3):
         return world_frame.mass_matrix_by_loops(model, q)
-    return kernel(recursions.crba, fallback=world_frame.mass_matrix)(model, q)
+    # Within a kernel the loops' products of all pairs, related or not, are written out: a sparse matrix has its own there.
+    is_small = model.nb <= tree_frames.MAX_BODIES_IN_MATRIX and pairs <= tree_frames.MAX_PAIRS
+    by_arrays = world_frame.mass_matrix if is_small else world_frame.mass_matrix_by_loops
+    return kernel(recursions.crba, fallback=by_arrays, alone=is_small)(model, q)
 
 
 def coriolis_matrix(
@@ -163,23 +167,7 @@ def forward_dynamics(
     q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
     if external is not None:
         tau = tau + generalized_force(model, q, external)
-    # The derivative of the solve is M^-1 times that of inverse dynamics, so ABA itself is never differentiated.
-    form, tangent = _FORWARD_DYNAMICS[_recursions(model)]
-    return kernel(form, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
-
-
-def _count_pairs(model: Model) -> int:
-    return int(model.topology.ancestors.sum())
-
-
-def _is_dense(model: Model) -> bool:
-    # Within a kernel the products of all pairs, related or not, are written out: a sparse matrix is better written by its own.
-    return _count_pairs(model) > max(tree_frames.MAX_PAIRS, model.nb**2 // 3)
-
-
-@variant(_is_dense)
-def _has_many_pairs(model: Model) -> bool:
-    return model.nb > tree_frames.MAX_BODIES_IN_MATRIX or _count_pairs(model) > tree_frames.MAX_PAIRS
+    return _by_recursions(model, _FORWARD_DYNAMICS, _solve_for_acceleration)(model, q, v, tau)
 
 
 def rnea(
@@ -229,29 +217,26 @@ mass_matrix_sqrt = _by_name(
 _MAX_BODIES_IN_MATRICES = 16
 
 
-# Inside of kernels, what is written out shares its numbers with the rest, such as the rows of loops.
-@variant(lambda: tree_frames.MAX_BODIES + 1)
-def _least_bodies_in_sweeps() -> int:
-    return tree_frames.MIN_BODIES_IN_SWEEPS
-
-
-def _recursions(model: Model) -> Any:
-    """The module with the recursions of a model."""
-    # Robots with floating bases have most axes at right angles.
-    least = tree_frames.MAX_BODIES + 1 if sweeps.has_base(model) else _least_bodies_in_sweeps()
-    if model.nb >= least and sweeps.has_sweeps(model):
-        return sweeps
-    return recursions if model.nb <= tree_frames.MAX_BODIES else scans
-
-
 def by_recursion(recursion, matrices, model: Model, *args):
     """Evaluate recursion(model, *args) as a kernel, or the equal `matrices`, as loops over the bodies where these are many."""
-    form = _recursions(model)
-    if form is sweeps:
-        recursion = getattr(sweeps, recursion.__name__, recursion)
-    elif form is scans:
-        recursion = matrices
-    return kernel(recursion, fallback=matrices)(model, *args)
+    forms = {recursions: recursion, sweeps: getattr(sweeps, recursion.__name__, recursion), scans: matrices}
+    return _by_recursions(model, {form: (function, None) for form, function in forms.items()}, matrices)(model, *args)
+
+
+def _by_recursions(model: Model, forms: Mapping, fallback: Callable) -> Callable:
+    """The kernel of a function that `forms` has for each module of recursions, with its derivative."""
+
+    def by(form, fallback=fallback, alone=True):
+        function, tangent = forms[form]
+        return kernel(function, fallback=fallback, derivative=tangent, alone=alone)
+
+    is_written_out = model.nb <= tree_frames.MAX_BODIES
+    # Robots with floating bases have most axes at right angles.
+    least = tree_frames.MAX_BODIES + 1 if sweeps.has_base(model) else tree_frames.MIN_BODIES_IN_SWEEPS
+    if model.nb < least or not sweeps.has_sweeps(model):
+        return by(recursions if is_written_out else scans)
+    # Inside of kernels, what is written out shares its numbers with the rest, such as the rows of loops.
+    return by(recursions, by(sweeps), alone=False) if is_written_out else by(sweeps)
 
 
 def _by_matrices(matrices, model: Model, *args):
@@ -294,7 +279,8 @@ def _tangent(*args):
     return _value_and_tangent(*args)[1]
 
 
-# For each module of recursions its forward dynamics and their derivative.
+# For each module of recursions its forward dynamics and their derivative. The derivative of the solve is M^-1 times that of
+# inverse dynamics, so that ABA itself is never differentiated.
 _FORWARD_DYNAMICS: dict[Any, tuple[Callable, Callable]] = {
     form: (value, functools.partial(_tangent, inverse, form.acceleration_and_inverse))
     for form, value, inverse in (

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp
+from jaxdyn.compile.batch import rarely
 from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.redundancy import exchange_rows
-from jaxdyn.constraints.selection import project_after_exchange, renew_rows
+from jaxdyn.constraints.selection import are_rows_poor, renew_rows
 from jaxdyn.contact.forces import contact_forces
 from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.dynamics.kinematics import frame_pose
@@ -18,7 +19,7 @@ from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, value
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import CONTACT_OUTPUTS
 from jaxdyn.simulation.events import Conditions, contact_allowances, limit_allowances
-from jaxdyn.simulation.methods import Method, Projected
+from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.options import Pose
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
@@ -167,12 +168,11 @@ class Equations:
         """Correct the state and the error at the end of a step, and renew what is constant during the next one."""
         scene, control, method = self.unpack(args, y)
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
-        end, error = method.end_step(scene, y, t, error)
+        end, error, is_poor = method.end_step(scene, y, t, error)
         y = method.renew(scene, end, t)
         if KEPT in y:
-            rows = renew_rows(scene, retract(scene.system, y["q"]), t, isinstance(method, Projected))
-            y = project_after_exchange(y[KEPT], rows, lambda y: method.correct(exchange_rows(scene, rows), y, t), y)
-            y = y | {KEPT: rows}
+            is_poor = are_rows_poor(scene, retract(scene.system, y["q"]), t) if is_poor is None else is_poor
+            y = rarely(is_poor, functools.partial(_renew_rows, scene, method, t), y)
         if controls.HELD in y:
             y = y | {controls.HELD: controls.sample(control, y[controls.HELD], *method.to_qv(scene, y, t), t)}
         return end, y, error
@@ -236,6 +236,17 @@ class Equations:
 def _advance(eqs: Equations, args, t0, t1, y, carried):
     scene, _, method = eqs.unpack(args, y)
     return method.advance(scene, y, t0, t1, carried, functools.partial(eqs.generalized_force, args, y))
+
+
+def _renew_rows(scene: Scene, method: Method, t, y: dict[str, Any]) -> dict[str, Any]:
+    """The state with the rows of the next step, where the kept ones are nearly dependent.
+
+    Rows of rounded numbers that were dropped are open by the rounding. The step after an exchange would close them, and take the
+    distance for its error, which no shorter step reduces.
+    """
+    rows = renew_rows(scene, retract(scene.system, y["q"]), t)
+    is_new, moved = jnp.any(y[KEPT] != rows), method.correct(exchange_rows(scene, rows), y, t)
+    return jax.tree.map(lambda x, y: jnp.where(is_new, x, y), moved, y) | {KEPT: rows}
 
 
 def _constants(y) -> dict[str, Any]:

@@ -48,6 +48,7 @@ from jaxdyn.systems.scene import Scene, as_pytree, is_given
 from jaxdyn.systems.system import displace, needs_retraction, rate_to_velocity, retract, velocity_to_rate
 
 State: TypeAlias = dict[str, Any]  # arrays, and pytrees of them, by name
+StepEnd: TypeAlias = tuple[State, State | None, Array | None]  # of `Method.end_step`
 Q: TypeAlias = Float[Array, " nq"]
 V: TypeAlias = Float[Array, " nv"]
 Force: TypeAlias = Float[Array, " nv"] | None
@@ -106,9 +107,12 @@ class Method(eqx.Module):
         """Project the start (q, v) onto the constraints by the least change."""
         return project_state(scene, q, v, t)
 
-    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
-        """Correct the state after a step, and take from its estimated error (a state, or None) what constraints remove."""
-        return y | {"q": retract(scene.system, y["q"])}, error
+    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> StepEnd:
+        """Correct the state after a step, and take from its estimated error (a state, or None) what constraints remove.
+
+        Also whether the kept rows are nearly dependent, None where that is not known (`are_rows_poor`).
+        """
+        return y | {"q": retract(scene.system, y["q"])}, error, None
 
     def renew(self, scene: Scene, y: State, t: Number) -> State:
         """Renew the entries of `step_constants` for the next step."""
@@ -161,15 +165,15 @@ class Projected(Multipliers):
     name: ClassVar[str] = "projected"
     projects: ClassVar[bool] = True
 
-    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
+    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> StepEnd:
         """Project q and v onto the constraints, and the error onto their tangent space."""
         # An error of q is the rate of a displacement: as such it is tangent or normal to the constraints, with or without
         # quaternions.
         errors = () if error is None else (_position_error(scene, y["q"], error), error["v"])
-        q, v, errors = project_step(scene, y["q"], y["v"], t, errors, self.rank_tol)
+        q, v, errors, is_poor = project_step(scene, y["q"], y["v"], t, errors, self.rank_tol)
         if error is not None:
             error = error | {"q": velocity_to_rate(scene.system, q, errors[0]), "v": errors[1]}
-        return y | {"q": q, "v": v}, error
+        return y | {"q": q, "v": v}, error, is_poor > 0
 
     def correct(self, scene: Scene, y: State, t: Number) -> State:
         """Project q and v onto the constraints."""
@@ -304,15 +308,15 @@ class Reduced(Method):
         """True if there are holonomic rows, quaternions, or a reference to be renewed."""
         return bool(holonomic_rows(layout(scene)).size or self.step_constants or needs_retraction(scene.system))
 
-    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
+    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> StepEnd:
         """Project q onto the holonomic constraints, and its error onto their tangent space; nu stays."""
         if not holonomic_rows(layout(scene)).size:
             return super().end_step(scene, y, t, error)
         errors = () if error is None else (_position_error(scene, y["q"], error),)
-        q, _, errors = project_step(scene, y["q"], jnp.zeros((scene.nv,), y["q"].dtype), t, errors)
+        q, _, errors, _ = project_step(scene, y["q"], jnp.zeros((scene.nv,), y["q"].dtype), t, errors)
         if error is not None:
             error = error | {"q": velocity_to_rate(scene.system, q, errors[0])}
-        return y | {"q": q}, error
+        return y | {"q": q}, error, None
 
     def renew(self, scene: Scene, y: State, t: Number) -> State:
         """Take N(q) as the new reference, which changes neither N(q) nor nu."""

@@ -166,7 +166,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
 
     def project(since, y, error, args):
         scene, t, _ = unpack(since, args)
-        y, error = method.end_step(scene, y, t, error)
+        y, error, _ = method.end_step(scene, y, t, error)
         return y, y, error
 
     def switching(since, y, args):

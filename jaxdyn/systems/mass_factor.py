@@ -11,34 +11,14 @@ call, and two calls of a large batch at once can wait for each other for ever (j
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import cholesky_factor, entry_point, kernel, triangular_solution, variant
-
-# Rows of a matrix up to which its factor is written out, with several samples in a vector: operations grow as the cube. Loops
-# over its rows are as fast from 40 rows on, and compile in a tenth of the time.
-_MOST_WRITTEN_OUT = 32
+from jaxdyn.compile import cholesky_factor, entry_point, triangular_solution
 
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix, of which the lower triangle is read; NaN where it is not positive definite."""
-    if matrix.shape[-1] == 0:  # a model without moving bodies
-        return matrix
-    return _factor(None, matrix)
-
-
-def _cholesky(_, matrix):
-    # Without symmetrisation derivatives and operations are those of the lower triangle alone.
-    return lax.linalg.cholesky(matrix, symmetrize_input=False)
-
-
-# Inside of a kernel a factor is written in its place, where the zeros of the matrix are known.
-@variant(_cholesky)
-def _factor(_, matrix):
-    is_short = matrix.shape[-1] <= _MOST_WRITTEN_OUT
-    return kernel(_cholesky)(None, matrix) if is_short else cholesky_factor(matrix)
+    return cholesky_factor(matrix) if matrix.size else matrix  # of a model without moving bodies
 
 
 def is_definite(matrix: Float[Array, "n n"], factor: Float[Array, "n n"]) -> Bool[Array, ""]:
@@ -60,20 +40,7 @@ def solve_lower(
     factor: Float[Array, "n n"], right: Float[Array, "n *k"], *, transposed: bool = False
 ) -> Float[Array, "n *k"]:
     """L^-1 right, or L^-T right."""
-    if factor.shape[-1] == 0:
-        return right
-    return _solve(transposed, None, factor, right)
-
-
-def _solve_lower(transposed: bool, _, factor, right):
-    return solve_triangular(factor, right, lower=True, trans=int(transposed))
-
-
-@variant(_solve_lower)
-def _solve(transposed: bool, _, factor, right):
-    if max(factor.size, right.size) > _MOST_WRITTEN_OUT**2:
-        return triangular_solution(factor, right, transposed)
-    return kernel(_solve_lower, static=1)(transposed, None, factor, right)
+    return triangular_solution(factor, right, transposed) if factor.size else right
 
 
 def solve_cholesky(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:

@@ -14,7 +14,7 @@ from kernel_helpers import assert_close, quick
 from jaxdyn import compile as backend
 from jaxdyn.compile import careful as pairs
 from jaxdyn.compile import kernel, mark_invalid, rolled, target
-from jaxdyn.compile.batch import any_sample
+from jaxdyn.compile.batch import any_sample, rarely
 from jaxdyn.compile.kernels import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.compile.operations import as_operations
 from jaxdyn.compile.primitive import kernel_p
@@ -244,12 +244,12 @@ def test_iterations_of_a_loop(count):
         return backend.mark_invalid(x < 0, y), jnp.zeros((), jnp.int32)
 
     short = backend.kernel(lambda _, x: backend.mark_invalid(x > 3, 2 * x), fallback=lambda _, x: x - 4)
-    own = backend.variant(lambda x: backend.mark_invalid(x > 1, x), marks=True)(lambda x: jnp.where(x > 1, 0.5 * x, x))
 
     def turn(_, constants, state, __):
         x, ways, k = state
         x, way = long((), x)
-        x = own(short((), x) + constants)
+        x = short((), x) + constants
+        x = rarely(x > 1, lambda x: 0.5 * x, x)
         return Iteration((x, ways + way, k + 1), k < 9, k + 1 < 9)
 
     def run(x):
