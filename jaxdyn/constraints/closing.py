@@ -28,7 +28,7 @@ from jaxdyn.model.configuration import difference
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, is_definite, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import displace, displacement, retract
+from jaxdyn.systems.system import displace, displacement, has_dependent_coordinates, retract, search_from
 
 # Longest step of the path, rad or lengths of the mechanism: within it, rows turn by less than a right angle.
 _LONGEST = 0.2
@@ -305,6 +305,25 @@ def polish(scene: Scene, q, t, rank_tol):
     return lax.while_loop(improves, improve, (q, size(q), jnp.asarray(True), 0))[0]
 
 
+def slide_to_place(scene: Scene, guess, start, t, rank_tol, bounds=None) -> tuple[Array, Slide]:
+    """Configuration at the end of `slide_to_nearest`, and that end."""
+
+    def slide(near, start):
+        end = slide_to_nearest(scene, near, start, t, rank_tol, bounds)
+        return displace(scene.system, near, end.e), end
+
+    if not has_dependent_coordinates(scene.system):
+        return slide(guess, start)
+
+    # Displacements from the guess have the dependent coordinates of the start, and then of a first end far from there.
+    def again(_, state):
+        place, end = slide(search_from(scene.system, guess, state[0]), state[0])
+        return retract(scene.system, place), end
+
+    none = jnp.zeros((scene.nv,), guess.dtype)
+    return lax.fori_loop(0, 2, again, (start, Slide(none, none, jnp.zeros((), guess.dtype))))
+
+
 def nearest_configuration(scene: Scene, guess, start, t, rank_tol, solve: Callable | None = None):
     """The configuration on the constraints nearest to a guess, from a start close to it, with the derivatives of a minimum.
 
@@ -313,14 +332,15 @@ def nearest_configuration(scene: Scene, guess, start, t, rank_tol, solve: Callab
     """
 
     def slide(scene, guess, start, t):
-        end = slide_to_nearest(scene, guess, start, t, rank_tol)
-        return polish(scene, displace(scene.system, guess, end.e), t, rank_tol), end.is_nearest
+        place, end = slide_to_place(scene, guess, start, t, rank_tol)
+        return polish(scene, place, t, rank_tol), end.is_nearest
 
     solve = solve or slide
 
     def differentiable(scene, q, start, t):
         fixed, guess, *others = stop_gradient((scene, q, start, t))
         place, is_nearest = lax.stop_gradient(solve(fixed, guess, *others))
+        q = search_from(scene.system, q, place)
         end = displace(scene.system, q, _stationary(scene, q, t, displacement(scene.system, guess, place), rank_tol))
         # Only the derivative of `end` is used: from the guess to the solution and back, its value has lost digits.
         return retract(scene.system, place + (end - lax.stop_gradient(end))), is_nearest

@@ -118,7 +118,7 @@ class ConfigurationError(Constraint):
     name: str = eqx.field(static=True, default="configuration", kw_only=True)
 
     def position(self, system, q, t):
-        """Displacement q - q_d; twists from the target for joints with rotations in space."""
+        """Displacement q - q_d; twists from the target for planar, spherical and free joints."""
         return displacement(system, target_value(self.target, t, q.shape, q), q)
 
 

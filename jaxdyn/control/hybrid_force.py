@@ -223,9 +223,12 @@ class GaugeInvariant(ForceLoop):
 
     $$\dot s + \Gamma_r s = V_2^T W^{-1} (M J (\ddot x_d - K_p \dot e) + (M \dot J + C J) (\dot x_d - K_p e)).$$
 
+    Where the rows have $b(q, t) \ne 0$, the velocities for given rates of the task have a part that they prescribe, and both
+    equations further terms.
+
     **Arguments:**
 
-    - `scene`: with constraints A v = 0; its forces are compensated.
+    - `scene`: with constraints A v = b; its forces are compensated.
     - `task`: x(q) -> (nr,), as many coordinates as degrees of freedom; `target`: (nr,), or a function of t,
       differentiable twice.
     - `kp` (1/s), of $\dot e + K_p e$; `kd` (1/s), of $\varepsilon$: positive definite, numbers, (nr,) or (nr, nr). A `kd` other
@@ -272,7 +275,7 @@ class GaugeInvariant(ForceLoop):
     ) -> Float[Array, " nv"]:
         """Joint torques (nv,), N m or N."""
         scene, system, t = self.scene, self.scene.system, jnp.asarray(t, q.dtype)
-        J, along, change = self._reference_motion(q, v, t)
+        J, along, change, held = self._reference_motion(q, v, t)
         # The Coriolis matrix and not h: it multiplies the reference velocity J s and not v.
         M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)
         # The count is given: under tracing it would be nv minus the number of rows, wrong for dependent ones.
@@ -281,9 +284,9 @@ class GaugeInvariant(ForceLoop):
         eps = matmul(gauge.V2.T, matmul(gauge.W.T, v - along))
         push = matmul(M, change) + matmul(C, along)
         push = push - matmul(gauge.W, matmul(gauge.V2, times(self.kd, eps, "kd")))
-        normal = matmul(gauge.Gamma_o, gauge.reduced_velocity) + matmul(
-            gauge.Lambda_r.T, self.force_command(q, t, state)
-        )
+        # Gamma_o w_r with its further terms where b != 0: across the motion all accelerations on the constraints are equal.
+        across = matmul(gauge.V1.T, solve_square(gauge.W, matmul(M, held) + matmul(C, v)))
+        normal = across + matmul(gauge.Lambda_r.T, self.force_command(q, t, state))
         # W V2 V2^T W^-1 takes the part of `push` along the motion; `normal` replaces the rest.
         free = matmul(gauge.V2, matmul(gauge.V2.T, solve_square(gauge.W, push)))
         tau = matmul(gauge.W, free + matmul(gauge.V1, normal))
@@ -305,7 +308,7 @@ class GaugeInvariant(ForceLoop):
         """
         system = self.scene.system
         q, v, t = check_state(system, q=q, v=v, t=t)
-        J, along, _ = self._reference_motion(q, v, t)
+        J, along, *_ = self._reference_motion(q, v, t)
         return matmul(self._to_quasi_velocities(q, t, J.shape[1]), v - along)
 
     def equivalent_gains(
@@ -327,7 +330,7 @@ class GaugeInvariant(ForceLoop):
         """
         q, t = check_state(self.scene.system, q=q, t=t)
         # J depends on q and t alone, so that any velocity gives the same.
-        J, _, _ = self._reference_motion(q, jnp.zeros((self.scene.nv,), q.dtype), t)
+        J, *_ = self._reference_motion(q, jnp.zeros((self.scene.nv,), q.dtype), t)
         B = matmul(self._to_quasi_velocities(q, t, J.shape[1]), J)
         kp, kd = as_matrix(self.kp, B[0], "kp"), as_matrix(self.kd, B[0], "kd")
         turned = solve_square(B, matmul(kd, B))
@@ -339,7 +342,7 @@ class GaugeInvariant(ForceLoop):
         return matmul(gauge.V2.T, gauge.W.T)
 
     def _reference_motion(self, q, v, t):
-        """Jacobian J (nv, nr), velocity J s for the reference rates s = xd_d - Kp e, and its rate, (nv,) each."""
+        """Jacobian J (nv, nr); velocity for the rates s = xd_d - Kp e, and its rate; an acceleration on the constraints."""
         scene, system = independent_rows(self.scene, q, t), self.scene.system
         errors = Scene(system, (self.error,))
         m = self.error.sizes(system, q.dtype)[0]
@@ -358,16 +361,23 @@ class GaugeInvariant(ForceLoop):
             speed = -rows(errors, q, jnp.zeros_like(v), t).velocity
             return speed - times(self.kp, self.error.position(system, q, t), "kp")  # pyright: ignore[reportArgumentType]
 
+        def prescribed(q, t):
+            """b (nc,) of A v = b: zero of constraints at rest."""
+            return -rows(scene, q, jnp.zeros_like(v), t).velocity
+
         A, turning = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), (q, t), motion)
         T, turning_of_task = jax.jvp(lambda q, t: constraint_jacobian(errors, q, t), (q, t), motion)
         # Constraints first: J = d v / d xd is the inverse of the task's rows in the motions that these leave. It is the last
-        # columns of the inverse of the stacked rows where that exists; elsewhere J s still satisfies the constraints.
+        # columns of the inverse of the stacked rows where that exists; elsewhere `along` still satisfies the constraints.
         inverse = pseudo_inverse(A, tolerance(None, A))
         # Rounding errors of rows that depend on the constraints are no directions.
         left = drop_rounding(T - matmul(matmul(T, inverse), A), T)
         J = pseudo_inverse(left, tolerance(None, left))
         s, sdot = jax.jvp(reference, (q, t), motion)
-        along = matmul(J, s)
-        # The rate of A v = 0, T v = s for v = J s.
-        change = -matmul(inverse, matmul(turning, along))
-        return J, along, change + matmul(J, sdot - matmul(turning_of_task, along) - matmul(T, change))
+        b, bdot = jax.jvp(prescribed, (q, t), motion)
+        moved = matmul(inverse, b)
+        along = moved + matmul(J, s - matmul(T, moved))
+        # The rate of A v = b, T v = s for v = along.
+        change = matmul(inverse, bdot - matmul(turning, along))
+        change = change + matmul(J, sdot - matmul(turning_of_task, along) - matmul(T, change))
+        return J, along, change, matmul(inverse, bdot - matmul(turning, v))

@@ -21,7 +21,7 @@ from jaxdyn.compile import entry_point, invalidate_derivatives
 from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.assembly import check_search, closing_tolerance, independent_rows_near
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
+from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_place
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.rank import condition_number, rank_of
 from jaxdyn.constraints.redundancy import (
@@ -47,7 +47,7 @@ from jaxdyn.control.targets import (
 from jaxdyn.model.arguments import Checked, Number, Numbers, check_flag, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import SceneLike, displace
+from jaxdyn.systems.system import SceneLike
 
 
 class InverseKinematics(Outcome):
@@ -272,10 +272,10 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         at_v = np.asarray([slot for place, slot in zip(*screw_joints(model), strict=True) if place in joints])
         endless = jnp.full((model.nv,), jnp.inf, q.dtype)
         bounds = (-endless).at[at_v].set(lower - guess[at]), endless.at[at_v].set(upper - guess[at])
-    end = slide_to_nearest(fixed, guess, q, time, None, bounds)
+    reached, end = slide_to_place(fixed, guess, q, time, None, bounds)
     # The set of joints at a limit is a decision without derivative.
     scene = scene_at(end.held[at_v] if joints else jnp.zeros((0,), q.dtype))
-    found = polish(stop_gradient(scene), displace(model, guess, end.e), time, None)
+    found = polish(stop_gradient(scene), reached, time, None)
     place, is_nearest = _with_derivatives(scene, posture, found, end.is_nearest, t)
     if not joints:
         return place, is_nearest > 0

@@ -43,7 +43,7 @@ class ComputedTorque(eqx.Module):
 
     $$\tau = M(q) a + C(q, v) v + N(q) - \tau_\mathrm{forces}, \quad \ddot e + K_d \dot e + K_p e = 0$$
 
-    e (nv,) is the displacement from the target to q: q - q_d, and for joints with rotations in space the twist from
+    e (nv,) is the displacement from the target to q: q - q_d, and for planar, spherical and free joints the twist from
     the target to q. Each error decays exactly as set by the gains for an exact model: for scalar gains
     with the roots of $s^2 + k_d s + k_p$. The twist is discontinuous at an error of half a turn.
 

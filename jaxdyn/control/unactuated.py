@@ -76,8 +76,8 @@ class GraspForce(ForceIntegral):
 
     $$\ddot e + K_d \dot e + K_p e = 0, \quad (\lambda - \lambda_d) + K_I z = 0$$
 
-    e (no,) is the displacement from the target to the object: differences of its coordinates, and for a free body the twist
-    that leads from the target to it. It decays as set by the gains for an exact model; contact forces are those
+    e (no,) is the displacement from the target to the object: differences of its coordinates, and for a planar or free body
+    the twist that leads from the target to it. It decays as set by the gains for an exact model; contact forces are those
     of least norm that carry the object, plus the internal part of `preload`. With integral action the internal part of
     $\lambda - \lambda_d$, which errors of the fingers' model cause, decays with `ki`. Redundant fingers move with the least
     acceleration from  -damping v, in the metric M; where they cannot follow the object in all directions, it is followed in

@@ -266,6 +266,17 @@ def has_dependent_coordinates(system) -> bool:
     return isinstance(system, Model) and system.nq > system.topology.nq
 
 
+def search_from(system, q: Float[Array, " nq"], other: Float[Array, " nq"]) -> Float[Array, " nq"]:
+    """q with the dependent coordinates of `other`, from which those of configurations displaced from q are searched.
+
+    A search finds them to rounding from close by only: where displacements lead far away, `other` is to be at their end.
+    """
+    if not has_dependent_coordinates(system):
+        return q
+    size = system.topology.nq
+    return jnp.concatenate([q[:size], other[size : system.nq]])
+
+
 def has_coordinate_rates(system) -> bool:
     """Decide whether v = dq/dt: velocities of planar, spherical and free joints are twists, or in axes that move."""
     return not (isinstance(system, Model) and {"planar", "spherical", "free"} & set(system.topology.kinds))

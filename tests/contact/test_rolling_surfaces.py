@@ -11,7 +11,7 @@ from test_contact_montana import PAIRS as ALL_PAIRS
 
 import jaxdyn as jd
 from jaxdyn import scenes, se3
-from jaxdyn.constraints.base import rows
+from jaxdyn.constraints.base import position_residual, rows
 from jaxdyn.contact import Cylinder, Ellipsoid, Parametrised, Plane, Sphere, montana, relative_pose
 from jaxdyn.model import inertia
 
@@ -218,6 +218,26 @@ def test_fingertips_that_cannot_reach_the_egg_are_refused():
     """The fixed point of their angles does not converge for tips that are long against the links."""
     with pytest.raises(ValueError, match=r"semi-axes .* does not reach its contact point"):
         jd.scenes.hand_rolling_egg.start(tip_semi_axes=(0.08, 0.02, 0.02))
+
+
+@pytest.mark.slow
+def test_assembly_from_far_away_ends_where_the_surfaces_touch():
+    """The places are the closest points there, not at the guess, and the displacement is along the gradient of the gap."""
+    scene = one_body(Ellipsoid([0.3, 0.2, 0.25]), Ellipsoid([0.1, 0.2, 0.15], poles="x"))
+    system = scene.system
+    guess = system.place(jnp.array([0.5, -0.6, 0.7, 0.8, -0.2, 0.4, 0.4]))
+    found = jd.assemble(scene, guess)
+    assert bool(system.is_consistent(found.q))
+    np.testing.assert_allclose(found.q, system.place(found.q[:7]), atol=1e-14)
+    # By the searched places and not by those of the assembly.
+    search = quick(lambda e: position_residual(scene, system.place(jd.integrate(system, guess, e)[:7]), 0.0)[0])
+    e, steps = jd.difference(system, guess, found.q), 1e-4 * np.eye(6)
+    gradient = (
+        np.array([8 * (search(e + d) - search(e - d)) - search(e + 2 * d) + search(e - 2 * d) for d in steps]) / 12e-4
+    )
+    force = np.asarray(jd.mass_matrix(system, guess) @ e)
+    np.testing.assert_allclose(search(e), 0.0, atol=1e-15)
+    np.testing.assert_allclose(force / np.linalg.norm(force), -gradient / np.linalg.norm(gradient), atol=1e-10)
 
 
 def egg_on_plane(axes):

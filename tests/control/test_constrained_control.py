@@ -165,6 +165,31 @@ def test_gauge_invariant_law_decays_as_its_gain_says(pendulum):
     np.testing.assert_allclose(solution.multipliers, np.tile(PRESS, (TS.size, 1)), atol=1e-9)
 
 
+@pytest.mark.parametrize("holonomic", [True, False])
+def test_gauge_invariant_law_on_a_moving_plane(holonomic):
+    """On z = x/2 + sin 2t, as positions and as rates: the energy of the velocity error decays, the force is the wanted one."""
+    p, k, mass, t = 2.0, 3.0, 1.3, 0.35
+    height = lambda q, t: q[2:] - 0.5 * q[:1] - jnp.sin(2 * t)  # noqa: E731
+    row, speed = jnp.array([[-0.5, 0.0, 1.0]]), lambda q, t: 2 * jnp.cos(2 * t)[None]
+    plane = jd.Holonomic(height) if holonomic else jd.Pfaffian(lambda q, t: row, speed)
+    particle = jd.LagrangianSystem(lambda q, v: 0.5 * mass * jnp.sum(v**2) - 9.81 * mass * q[2], 3)
+    scene = jd.Scene(particle, [plane])
+    law = jd.control.GaugeInvariant(scene, first_two, circle, p, k, force=PRESS)
+    q, v = jnp.array([0.3, -0.1, 0.15 + np.sin(2 * t)]), jnp.array([0.2, 0.7, 0.1 + 2 * np.cos(2 * t)])
+
+    @quick
+    def evaluate(q, v):
+        plant = jd.constrained_dynamics(scene, q, v, law(q, v, t), t)
+        energy = lambda q, v, t: jnp.sum(law.composite_error(q, v, t) ** 2)  # noqa: E731
+        return plant.multipliers, *jax.jvp(energy, (q, v, t), (v, plant.acceleration, 1.0))
+
+    force, energy, rate = evaluate(q, v)
+    slow = v[:2] - jax.jvp(circle, (t,), (1.0,))[1] + p * (q[:2] - circle(t))
+    np.testing.assert_allclose(energy, mass * (jnp.sum(slow**2) + (0.5 * slow[0]) ** 2), rtol=1e-12)
+    np.testing.assert_allclose(rate, -2 * k * energy, rtol=1e-11)
+    np.testing.assert_allclose(force, PRESS, rtol=1e-11)
+
+
 def test_geometric_and_gauge_invariant_laws_are_equal_for_matched_gains(pendulum, torques):
     """Kd' = Kp + Kd, Kp' = Kd Kp: equal where ed + Kp e = 0, elsewhere different by the Coriolis force of that error."""
     _, q, v = pendulum
