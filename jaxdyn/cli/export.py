@@ -90,3 +90,9 @@ def run(args: argparse.Namespace) -> None:
     # The folder may hold exports of other names.
     files = ", ".join(sorted(x.name for x in folder.iterdir() if x.name.startswith(name)))
     print(f"{exported} for {args.target}, in {folder}: {files}")
+    # The library refuses a scene here; the command has only a file, whose other parts would silently be lost.
+    if args.function in ("forward_dynamics", "inverse_dynamics") and (scene.constraints or scene.forces):
+        parts = [row.name for row in scene.constraints] + [type(force).__name__ for force in scene.forces]
+        print(
+            f"{args.function} is that of the tree, without {', '.join(parts)}; --function constrained_dynamics has them"
+        )

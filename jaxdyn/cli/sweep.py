@@ -14,9 +14,10 @@ import numpy as np
 
 from jaxdyn import scale, scenes
 from jaxdyn.cli.common import Stopwatch, add_cluster_options, check_least, check_memory, connect, option, whole
-from jaxdyn.io import load_model
+from jaxdyn.constraints.assembly import assemble
+from jaxdyn.io import load
 from jaxdyn.model.arguments import as_path
-from jaxdyn.model.configuration import integrate, neutral
+from jaxdyn.model.configuration import integrate
 from jaxdyn.simulation.events import events_of
 from jaxdyn.simulation.options import as_output
 from jaxdyn.simulation.run import simulate
@@ -34,7 +35,7 @@ examples:
   jaxdyn sweep study.toml --client tcp://10.0.0.1:8786
 
 study.toml:
-  scene = "rolling_disk"      a scene of jd.scenes, a file .urdf, or a file .py with functions
+  scene = "rolling_disk"      a scene of jd.scenes, a URDF, MJCF or SDF file, or a file .py with functions
                               scene(parameters) and states(parameters) -> (q0, v0)
   out = "disks.zarr"          relative to the folder of the study
   samples = 100000
@@ -45,7 +46,8 @@ study.toml:
   rows = true                 false: result codes and reductions only; or a list of names
 
   [parameters]                drawn for each rollout; arguments of a scene of jd.scenes and of its start;
-                              for a .urdf: q0 and v0, displacements from neutral (size is nv)
+                              of a robot's file: q0, a displacement from its placement, and v0 (size is nv); its
+                              loops and couplings are closed at the start
   mass = { uniform = [1.0, 3.0], units = "kg" }
   radius = { normal = [0.5, 0.01], units = "m" }     mean, standard deviation
   # damping = { log_uniform = [1e-3, 1.0], size = 2 }
@@ -259,19 +261,27 @@ def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[
         if missing:
             raise ValueError(f"{file} has no function {' and '.join(missing)} of the parameters")
         return module.scene, module.states
-    if file.suffix == ".urdf":
-        model = load_model(file)
+    if file.suffix:
+        # The scene and not the model alone: loops, couplings, springs, damping and friction of the file act.
+        loaded = load(file)
         if unknown := set(parameters) - {"q0", "v0"}:
-            raise ValueError(f"{path}: parameters of a .urdf are q0 and v0, not {', '.join(sorted(unknown))}")
+            raise ValueError(f"{path}: parameters of {file.name} are q0 and v0, not {', '.join(sorted(unknown))}")
 
         def states(p: Mapping[str, Any]) -> tuple[Any, Any]:
-            at_rest = jnp.zeros(model.nv)
-            # A displacement from neutral, since a draw of q itself would leave the unit quaternions.
-            return integrate(model, neutral(model), p.get("q0", at_rest)), p.get("v0", at_rest)
+            at_rest = jnp.zeros(loaded.nv)
+            # A displacement from the reference, since a draw of q itself would leave the unit quaternions.
+            q = integrate(loaded.system, loaded.starts["reference"].q, p.get("q0", at_rest))
+            v = jnp.asarray(p.get("v0", at_rest))
+            if not loaded.constraints:
+                return q, v
+            closed = assemble(loaded, q, v, throw=False)
+            return closed.q, closed.v
 
-        return model, states
+        return loaded, states
     if name not in scenes.names():
-        raise ValueError(f"{path}: scene is {name!r}; name one of {', '.join(scenes.names())}, or a file .py or .urdf")
+        raise ValueError(
+            f"{path}: scene is {name!r}; name one of {', '.join(scenes.names())}, or a file of a robot or .py"
+        )
     named = getattr(scenes, name)
     # A parameter may belong to the scene, to its start, or to both.
     of_scene, of_start = (set(inspect.signature(part).parameters) for part in (named, named.start_function))

@@ -112,7 +112,7 @@ class RESULTS(metaclass=_Enumeration):
     nonfinite_start = _code("The initial state is not finite, or a quaternion in it is zero.")
     nonfinite_state = _code("The state became NaN or infinite.")
     unordered_times = _code("The save points are not finite and increasing.")
-    bad_stepsize = _code("The step is not positive and finite.")
+    bad_stepsize = _code("The step is not positive and finite, or does not fit a sampled control.")
     bad_tolerance = _code("A tolerance is negative or not finite.")
     coarse_steps = _code(
         "The fixed steps are too long, or too many for the dtype: the motion may be wrong by a tenth of it or more."

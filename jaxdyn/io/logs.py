@@ -14,7 +14,12 @@ from jaxdyn.model.arguments import Checked, FilePath, as_path, parse_number
 from jaxdyn.model.tree import Model
 
 _SIGNALS = ("q", "v", "a", "tau")
-_NOTE = re.compile(r"\s+\[[^\]]*\]$")  # a unit after a column's name
+_NOTE = re.compile(r"\s+\[([^\]]*)\]$")  # a unit after a column's name
+# Parts of units that are none of SI, or are multiples: numbers in them would be read as rad, s, m, N or N m.
+_OTHER_UNITS = frozenset(
+    "° º deg degs degree degrees grad gon rev revs turn turns rpm ms msec us usec µs μs ns min mm cm km in inch inches ft "
+    "mnm knm ncm nmm mn kn gf kgf lbf lb oz".split()
+)
 
 
 def read_log(
@@ -32,7 +37,8 @@ def read_log(
     Columns: `t` (s); `q1, q2, ...` positions; `v1, ...` velocities and `a1, ...` accelerations (both optional); `tau1,
     ...` torques. The numbers may be replaced by joint names: `q_shoulder, tau_shoulder`. In an NPZ archive each column
     is an array (n,), or a signal is one array (n, columns) named `q`, `v`, `a`, `tau`. Columns of other names are
-    ignored, and so is a unit in brackets after a name of a CSV file, `q_shoulder [rad]`; numbers are taken in SI units.
+    ignored. A name in a CSV file may be followed by its unit in brackets, `q_shoulder [rad]`; numbers are taken in SI units, and
+    other units, such as [deg] and [ms], are refused.
     Columns of a CSV file may be separated by commas, semicolons or tabs; numbers have a decimal point.
 
     **Arguments:** `path`: of the file; `joint_names`: order of the joints in the result for columns with joint names (a model's
@@ -45,9 +51,9 @@ def read_log(
     **Returns:** `jd.identify.Log`; v and a are None when the file has none. Make them with `jd.identify.from_raw`.
 
     **Raises:** FileNotFoundError; ValueError, with the path, for another file type, a cell that is no number (line and
-    column), a first line that is no header, missing or repeated columns (with a `rename` that gives the joints their
-    names, where there are as many), everything that `Log` refuses (NaN, unequal lengths, time running backwards), and
-    outliers, with row and joint.
+    column), a first line that is no header, units that are not of SI, columns numbered from 0, missing or repeated columns
+    (with a `rename` that gives the joints their names, where there are as many), everything that `Log` refuses (NaN, unequal
+    lengths, time running backwards), and outliers, with row and joint.
     """
     path = as_path(path)
     readers = {".csv": _read_csv, ".npz": _read_npz}
@@ -133,7 +139,8 @@ def _read_csv(path) -> dict[str, np.ndarray]:
         # Semicolons win over commas: locales with decimal commas separate by semicolons.
         separator = next((sign for sign in ";,\t" if sign in names), ",")
         reader = csv.reader(file, delimiter=separator)
-        header = [_NOTE.sub("", name.strip()) for name in next(reader, [])]
+        titles = [name.strip() for name in next(reader, [])]
+        header = [_NOTE.sub("", title) for title in titles]
         if not header:
             raise ValueError(f"{path}: the file is empty; the first line names the columns t, q1, ..., tau1, ...")
         if all(_is_number(name) for name in header):
@@ -141,6 +148,8 @@ def _read_csv(path) -> dict[str, np.ndarray]:
                 f"{path}: line 1 is {', '.join(header[:3])}, ...: numbers, no header; the first line names the columns: t, q1, "
                 f"q2, ..., tau1, tau2, ... ({len(header)} columns)"
             )
+        for title, name in zip(titles, header, strict=True):
+            _check_unit(title, name, path)
         repeated = sorted({name for name in header if header.count(name) > 1})
         if repeated:
             raise ValueError(f"{path}: repeated columns {', '.join(repeated)}")
@@ -162,6 +171,19 @@ def _read_csv(path) -> dict[str, np.ndarray]:
                 ) from None
     table = np.array(rows).reshape(len(rows), len(header))
     return {name: table[:, i] for i, name in enumerate(header)}
+
+
+def _check_unit(title: str, name: str, path) -> None:
+    """Refuse a unit that is not of SI behind the name of a column that is read."""
+    note = _NOTE.search(title)
+    if note is None or re.fullmatch(rf"t|({'|'.join(_SIGNALS)})(\d+|_.+)", name) is None:
+        return
+    # `Solution.to_csv` writes the coordinate before the unit: q1 [base.x; m].
+    unit = note[1].split(";")[-1].strip()
+    if _OTHER_UNITS.intersection(re.split(r"[\s/*·.^²\d]+", unit.lower())):
+        raise ValueError(
+            f"{path}: column {name} is in {unit}; numbers are taken in s, rad, m, N and N m: convert the column and its unit"
+        )
 
 
 def _is_number(cell: str) -> bool:
@@ -192,13 +214,19 @@ def _assemble(columns: dict[str, np.ndarray], joint_names) -> Log:
     if "t" not in columns:
         raise ValueError(f"missing column t; the file has {', '.join(columns) or 'none'}")
     columns_of = {signal: _signal_columns(columns, signal) for signal in _SIGNALS}
+    if zero := [f"{signal}0" for signal in _SIGNALS if columns_of[signal].get("0") == f"{signal}0"]:
+        # They would be ignored, and the columns of the second joint taken for those of the first.
+        raise ValueError(f"columns are numbered from 0 ({', '.join(zero)}); number them from 1")
     for signal in ("q", "tau"):
         if not columns_of[signal]:
             hint = "" if signal == "q" else ' (of simulate: outputs=("torque",))'
             raise ValueError(f"missing columns {signal}1, {signal}2, ...{hint}; the file has {', '.join(columns)}")
     labels = list(columns_of["tau"])
-    # The torques decide, since every log has them and their columns are never quaternions.
-    by_number = all(label.isdecimal() for label in labels)
+    # The torques decide, since every log has them and their columns are never quaternions. tau_1 is of a joint named "1".
+    by_number = all(columns_of["tau"][label] == f"tau{label}" for label in labels)
+    for signal in _SIGNALS if by_number else ():
+        if named := [column for label, column in columns_of[signal].items() if column != f"{signal}{label}"]:
+            raise ValueError(f"columns of {signal} are named ({', '.join(named)}), those of tau numbered; use one kind")
     if not by_number:
         labels = list(joint_names) if joint_names is not None else labels
     missing = []

@@ -98,9 +98,9 @@ class Controller(eqx.Module):
 class Sampled(eqx.Module):
     """A discrete controller: the law is called at the start and after every `period`, and its torque is held in between.
 
-    It needs fixed steps (`stepsize`), of which a whole number fills a period. If a save point is a sampling instant, the outputs
-    "torque" and "control_state" there are the values before or after the sample, depending on the rounding of the times. To read
-    them, save between samples. The motion does not depend on that.
+    It needs fixed steps (`stepsize`), of which a whole number fills a period, and a whole number the run from ts[0] to ts[-1].
+    If a save point is a sampling instant, the outputs "torque" and "control_state" there are the values before or after the
+    sample, depending on the rounding of the times. To read them, save between samples. The motion does not depend on that.
 
     **Arguments:**
 
@@ -152,23 +152,49 @@ def as_control(control: Control) -> Any:
     return as_pytree(control, "control")
 
 
-def check_steps(control: Control, stepsize: object) -> None:
-    """Refuse steps that do not fit a sampled law: adaptive ones, and those that do not fill a period."""
+def fit_steps(control: Control, stepsize: Any, ts: Any, dtype) -> Any:
+    """Length of the steps of a run: for a sampled law that of a whole number of them in a period and in the run, else as given.
+
+    Steps of a run have one length, the longest one up to `stepsize` of which a whole number fills the run. Where that is another
+    length, no step ends when a sample is due, and the law would be called late. NaN for traced numbers that do not fit, which
+    ends the run with the code `bad_stepsize`.
+
+    **Raises:** ValueError for adaptive steps, and for known numbers that do not fit.
+    """
     if not isinstance(control, Sampled):
-        return
+        return stepsize
     if not isinstance(stepsize, (int, float, np.ndarray, jax.Array)):
         raise ValueError(
             "control is sampled, which takes fixed steps; pass stepsize=control.period, or a whole part of it"
         )
-    # Traced values cannot be compared while the program is made.
-    if is_concrete((control.period, stepsize)):
-        ratio = float(control.period) / float(np.asarray(stepsize))
-        # The relative tolerance admits steps that were written with six digits, such as 0.000333333 for a third of 1e-3.
-        if not (ratio > 0.5 and abs(ratio - round(ratio)) < 1e-6 * ratio):
-            raise ValueError(
-                f"stepsize is {float(np.asarray(stepsize)):.6g} s, and the period of the sampled control "
-                f"{float(control.period):.6g} s, which is {ratio:.6g} steps; take a whole part of it"
-            )
+    known, eps = is_concrete((control.period, stepsize, ts)), float(jnp.finfo(dtype).eps)
+    # Numpy outside of a trace, where each operation of JAX is a program of its own.
+    xp = np if known else jnp
+    period, step, span = xp.asarray(control.period), xp.asarray(stepsize), xp.asarray(ts[-1]) - xp.asarray(ts[0])
+    ratio = period / step
+    in_period = xp.round(ratio)
+    count = span * in_period / period
+    in_run = xp.round(count)
+    # The relative tolerance admits steps that were written with six digits, such as 0.000333333 for a third of 1e-3. That of the
+    # run is a fifth of the time within which `sample` takes a sample that is due.
+    fits_period = (ratio > 0.5) & (xp.abs(ratio - in_period) < 2e-6 * ratio)
+    fits_run = (in_run > 0) & (xp.abs(count - in_run) < 0.2 * eps**0.4 * in_period)
+    if is_concrete((control.period, stepsize)) and not fits_period:
+        raise ValueError(
+            f"stepsize is {float(step):.6g} s, and the period of the sampled control "
+            f"{float(period):.6g} s, which is {float(ratio):.6g} steps; take a whole part of it"
+        )
+    # A run without length has no steps, and times that do not increase are refused elsewhere.
+    is_run = span > 0
+    if known and is_run and not fits_run:
+        later = float(np.ceil(count) * period / in_period - span)
+        raise ValueError(
+            f"ts spans {float(span):.6g} s, which is {float(count):.6g} steps of {float(step):.6g} s; a run with a sampled "
+            f"control takes a whole number of them: end ts {later:.6g} s later, or take another stepsize"
+        )
+    # Rounding must not make one step more of it.
+    length = xp.where(is_run, span / xp.where(in_run > 0, in_run, 1) * (1 + 8 * eps), step)
+    return length if known else jax.lax.stop_gradient(jnp.where(fits_period & (fits_run | ~is_run), length, jnp.nan))
 
 
 def can_end(control: Control, q, v, t) -> bool:

@@ -170,7 +170,8 @@ def simulate(
     concrete = is_known(scene, control, method, arrays, stepsize, terminals)
     start = tuple([np.asarray(x) if concrete else as_numpy_if_known(x) for x in arrays[:3]])
     scene, method = _prepare_start(scene, method, start, stepsize, modal, concrete)
-    controls.check_steps(control, stepsize)
+    dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
+    length = controls.fit_steps(control, stepsize, start[2], dtype)
     check_terminals(terminals, modal, (start[0], start[1], start[2][0]) if concrete else None)
     solver = _solver_at_start(scene, control, solver, stepsize, adjoint, arrays, modal)
     options = _choose(
@@ -185,11 +186,10 @@ def simulate(
         selects_rows=not (concrete or not scene.constraints or is_concrete((scene, method, start)))
         and (method.rank_tol is not None or may_have_redundant_rows(scene)),
     )
-    dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
     # Known numbers go to the compiled program as they are: each array of JAX made before would be a transfer of its own.
     to_array = np.asarray if concrete and not modal else jnp.asarray
     numbers: list[Any] = [x if isinstance(x, jax.Array) and x.dtype == dtype else to_array(x, dtype) for x in arrays]
-    numbers.append(to_array(stepsize, dtype) if has_length else stepsize)
+    numbers.append(to_array(length, dtype) if has_length else stepsize)
     if modal:
         solution = hybrid_motion(scene, control, numbers, options)
     else:

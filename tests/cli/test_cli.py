@@ -554,6 +554,20 @@ def test_export_writes_the_function(name, arm, folder, run):
     np.testing.assert_allclose([float.fromhex(x) for x in numbers.split(", ")], wanted.ravel(), rtol=1e-12, atol=1e-12)
 
 
+def test_export_names_what_a_function_of_the_tree_leaves_out(folder, run):
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    joint = '<joint name="{0}" type="continuous"><parent link="base"/><child link="{1}"/><axis xyz="0 0 1"/>{2}</joint>'
+    (folder / "rotors.urdf").write_text(
+        f'<robot name="r"><link name="base"/><link name="a">{inertial}</link><link name="b">{inertial}</link>'
+        + joint.format("j", "a", '<dynamics damping="0.4"/>')
+        + joint.format("k", "b", '<mimic joint="j"/>')
+        + "</robot>"
+    )
+    assert "without gear k-j, JointDamping; --function constrained_dynamics" in run("export rotors.urdf --out out")
+    assert "without" not in run("export rotors.urdf --function constrained_dynamics --out out")
+    assert "without" not in run("export rotors.urdf --function mass_matrix --out out")
+
+
 def test_debug_shows_where_an_error_arose():
     with pytest.raises(ValueError, match=r"nowhere\.urdf"):
         main(["info", "nowhere.urdf", "--debug"])

@@ -1,5 +1,6 @@
 """Controllers with a state, sampled ones, and their outputs."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -186,6 +187,54 @@ def test_a_law_without_a_state_is_sampled(arm):
     assert 1e-6 < difference[1] < difference[0] < 0.01
     # First order in the period; the second order makes the ratio 2.008.
     np.testing.assert_allclose(difference[0] / difference[1], 2.0, rtol=0.05)
+
+
+@pytest.fixture(scope="module")
+def slider():
+    """A mass of 2 kg."""
+    builder = jd.ModelBuilder("slider", gravity=None)
+    builder.add_body("mass", joint="prismatic", axis=(1, 0, 0), inertia=(2.0, (0, 0, 0), (1, 1, 1)))
+    return builder.build()
+
+
+COUNT = jd.Sampled(lambda q, v, t, state: (state[None], state + 1.0), 0.0, 1.0)  # torques 0, 1, 2, ... N
+
+
+def with_period(period):
+    return eqx.tree_at(lambda law: law.period, COUNT, jnp.asarray(period))
+
+
+@pytest.mark.parametrize("t0", [0.0, 0.7, 1000.3])
+@pytest.mark.parametrize(
+    ("period", "step"), [(1 / 3, 1 / 9), (0.7, 0.1), (0.03, 0.01), (0.01, 0.00333333), (0.05, 0.05)]
+)
+def test_samples_are_taken_when_they_are_due(slider, period, step, t0):
+    """In closed form: the k-th sample accelerates by k / 2 m/s^2, and v = period k (k + 1) / 4 after it."""
+    n = 21
+    times = t0 + np.array([0.0, 5.5 * period, n * period])
+    motion = jd.simulate(slider, [0.0], [0.0], times, control=with_period(period), stepsize=step)
+    speeds = [0.0, period * 10 / 2 + 0.5 * period * 5 / 2, period * n * (n - 1) / 4]
+    np.testing.assert_allclose(motion.v[:, 0], speeds, rtol=1e-8)
+
+
+def test_runs_that_samples_do_not_fill_are_refused(slider):
+    """Steps have one length, which fills the run: of 2 s 1/67, where 0.03 s are asked for, and a sample would be late."""
+    given = {"control": with_period(0.09), "stepsize": 0.03}
+    with pytest.raises(ValueError, match=r"ts spans 2 s, which is 66.6667 steps of 0.03 s; .* end ts 0.01 s later"):
+        jd.simulate(slider, [0.0], [0.0], [0.0, 2.0], **given)
+    np.testing.assert_allclose(jd.simulate(slider, [0.0], [0.0], [0.0, 2.01], **given).v[-1], 10.725, rtol=1e-12)
+
+    @jax.jit
+    def run(period, step, end):
+        motion = jd.simulate(
+            slider, [0.0], [0.0], jnp.stack([0 * end, end]), control=with_period(period), stepsize=step, throw=False
+        )
+        return motion.v[-1, 0], motion.result == jd.RESULTS.bad_stepsize
+
+    assert run(0.09, 0.03, 2.0)[1] and run(0.09, 0.04, 1.8)[1]
+    speed, refused = run(0.09, 0.03, 1.8)
+    assert not refused
+    np.testing.assert_allclose(speed, 0.09 * 20 * 19 / 4, rtol=1e-12)
 
 
 def changing(q, v, t, state):

@@ -270,6 +270,39 @@ def test_cells_that_only_python_reads_are_refused(cell, tmp_path):
         read_log(tmp_path / "log.csv")
 
 
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("t,q1 [deg],tau1", r"column q1 is in deg; .* convert"),
+        ("t [ms],q1 [rad],tau1", "column t is in ms"),
+        ("t [s],q1 [base.x; mm],tau1", "column q1 is in mm"),
+        ("t,q_a [rad],v_a [°/s],tau_a", "column v_a is in °/s"),
+        ("t,q1 [rad],tau1 [N·mm]", "column tau1 is in N·mm"),
+        ("t,q0,q1,tau0,tau1", r"columns are numbered from 0 \(q0, tau0\); number them from 1"),
+        ("t,q_a,tau1", r"columns of q are named \(q_a\), those of tau numbered; use one kind"),
+    ],
+)
+def test_units_and_numbers_that_would_be_misread_are_refused(header, words, tmp_path):
+    path, n = tmp_path / "log.csv", header.count(",") + 1
+    path.write_text("\n".join([header, *(",".join([str(i)] * n) for i in range(3))]), encoding="utf-8")
+    with pytest.raises(ValueError, match=words):
+        read_log(path)
+    # The same unit of a column that is not read does no harm.
+    path.write_text("t [s],q1 [rad],tau1 [N m],speed [rpm]\n0,1,2,3\n1,1,2,3\n", encoding="utf-8")
+    assert read_log(path).q.shape == (2, 1)
+
+
+@pytest.mark.parametrize("order", [("1", "10", "2"), None])
+def test_joints_whose_names_are_numbers(order, tmp_path):
+    """A model sorts its joints by their names as texts: 1, 10, 2. Their columns are no numbers of columns."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,q_1,q_10,q_2,tau_1,tau_10,tau_2\n0,1,10,2,1,10,2\n1,1,10,2,1,10,2\n")
+    log = read_log(path, joint_names=order)
+    assert log.joint_names == ("1", "10", "2")
+    np.testing.assert_array_equal(log.q, [[1, 10, 2]] * 2)
+    np.testing.assert_array_equal(log.tau, log.q)
+
+
 def test_logs_in_other_encodings_are_refused_with_their_line(tmp_path):
     (tmp_path / "log.csv").write_bytes("t,q_机,tau_机\n0,0,0\n".encode("gbk"))
     with pytest.raises(ValueError, match=r"log.csv: line 1 is not UTF-8 .*; save the file as UTF-8"):

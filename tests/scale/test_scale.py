@@ -753,6 +753,34 @@ def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     assert "is built from concrete numbers, so that count cannot be drawn" in capsys.readouterr().err
 
 
+ROTORS = """<robot name="rotors"><link name="base"/>
+  <link name="a"><inertial><mass value="1"/><inertia ixx="0.5" iyy="0.5" izz="0.5" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="b"><inertial><mass value="1"/><inertia ixx="0.5" iyy="0.5" izz="0.5" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="j" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/><dynamics damping="0.4"/></joint>
+  <joint name="k" type="continuous"><parent link="base"/><child link="b"/><axis xyz="0 0 1"/>
+    <mimic joint="j" multiplier="-2"/></joint></robot>"""
+SPRING = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="h" axis="0 0 1" ref="0.3" springref="0.3" stiffness="8"/>
+  <inertial pos="0 0 0" mass="1" diaginertia="2 2 2"/></body></worldbody></mujoco>"""
+
+
+def test_sweep_takes_couplings_springs_and_damping_of_a_file(tmp_path):
+    """A coupled and damped pair: (J + 4 J) dv/dt = -0.4 v, from the projection of v0; a spring at its reference, w = 2."""
+    from jaxdyn.cli import main
+
+    study, head = tmp_path / "study.toml", 'out = "a.zarr"\nsamples = 2\nduration = 1.0\n'
+    (tmp_path / "rotors.urdf").write_text(ROTORS)
+    study.write_text(head + 'scene = "rotors.urdf"\n[parameters]\nv0 = { uniform = [1.0, 1.0], size = 2 }\n')
+    assert main(["sweep", str(study), "--quiet"]) == 0
+    v = xarray.open_zarr(tmp_path / "a.zarr", chunks=None).v.values
+    np.testing.assert_allclose(v[:, 0], [[-0.2, 0.4]] * 2, rtol=1e-12)
+    np.testing.assert_allclose(v[:, 1], v[:, 0] * np.exp(-0.4 / 2.5), rtol=1e-7)
+    (tmp_path / "spring.xml").write_text(SPRING)
+    study.write_text(head + 'scene = "spring.xml"\n[parameters]\nq0 = { uniform = [0.1, 0.1], size = 1 }\n')
+    assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "b.zarr")]) == 0
+    q = xarray.open_zarr(tmp_path / "b.zarr", chunks=None).q.values
+    np.testing.assert_allclose(q[:, 1], 0.3 + 0.1 * np.cos(2.0), rtol=1e-7)
+
+
 def test_stores_that_cannot_be_are_refused_with_the_cause(tmp_path, monkeypatch):
     parameters = {"x": np.linspace(1.0, 2.0, 4)}
     (tmp_path / "file").write_text("x")
