@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.model.arguments import Checked, Numbers, is_concrete
-from jaxdyn.model.topology import KINDS
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
 
 # Columns that jump are evaluated on this many times the samples of a log before they are low-passed.
@@ -287,7 +287,4 @@ def idle_coordinates(model: Model, logs: Sequence[Log]) -> tuple[int, ...]:
 
 def are_angles(model: Model) -> np.ndarray:
     """Mask (nv,) of the coordinates that are angles."""
-    linear = {"prismatic": (True,), "planar": (True, True, False), "free": (True,) * 3 + (False,) * 3}
-    return ~np.concatenate(
-        [np.array(linear.get(kind, (False,) * KINDS[kind].nv), bool) for kind in model.topology.kinds]
-    )
+    return np.array([unit == "rad/s" for unit in columns_of(model).v_units])
