@@ -132,18 +132,18 @@ def check_log(log: Log, system, *, needs=("v", "a")) -> None:
         )
 
 
-def filter_like_log(log: Log, columns: np.ndarray, order: int = 4, factor: int = 1) -> np.ndarray:
+def filter_like_log(log: Log, columns: np.ndarray, factor: int = 1) -> np.ndarray:
     """Columns (n, ...) as the log's low-pass would have left them; unchanged for a log that was not filtered.
 
     `factor`: samples of the columns per sample of the log; every `factor`-th is returned.
     """
     cutoff = log.cutoff
-    if cutoff is None or not _has_filter(log, order):
+    if cutoff is None or not _has_filter(log):
         return columns if factor == 1 else columns[::factor]
     if not columns.size:
         return columns[::factor]
     # The refined samples have a higher rate: the cut-off stays the same in Hz.
-    return low_pass(columns, factor * log_rate(log), cutoff, order)[::factor]
+    return low_pass(columns, factor * log_rate(log), cutoff)[::factor]
 
 
 def low_pass(x: np.ndarray, rate: float, cutoff: float, order: int = 4) -> np.ndarray:
@@ -185,8 +185,8 @@ def refine_samples(samples: np.ndarray, factor: int) -> np.ndarray:
     return CubicSpline(np.arange(len(samples)), samples)(places)
 
 
-def _has_filter(log: Log, order: int = 4) -> bool:
-    shortest = 3 * (order + 1) + 1
+def _has_filter(log: Log) -> bool:
+    shortest = 16  # of SciPy's default padding for a filter of fourth order
     # Near the Nyquist frequency, half the sampling rate, there is no band left to remove; above it no filter exists.
     return log.cutoff is not None and log.cutoff < 0.45 * log_rate(log) and len(log) >= shortest
 
