@@ -31,41 +31,18 @@ METRICS = ("entropic", "affine")
 _UPPER = np.triu_indices(4, 1)
 
 
-# Entries of the factor that the coordinates after the first one change.
+# Entries of the factor that the coordinates after the first one change, and of a factor over exp(alpha): these and the last, 1.
 LOG_CHOLESKY_PLACES = [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
-
-
-def _log_cholesky_basis() -> np.ndarray:
-    """U + U^T (10, 4, 4) for the derivatives U of `inertia.log_cholesky_factor` at zero."""
-    basis = np.zeros((10, 4, 4))
-    # The first coordinate scales the whole factor: the density of the body.
-    basis[0] = np.eye(4)
-    for k, place in enumerate(LOG_CHOLESKY_PLACES, 1):
-        basis[(k, *place)] = 1
-    # d(U U^T) = dU + dU^T at U = 1.
-    return basis + np.swapaxes(basis, 1, 2)
-
-
-def _from_pseudo() -> np.ndarray:
-    """The linear map (10, 4, 4) of `inertia.parameters_from_pseudo`: m, m c and tr(Sigma) 1 - Sigma of a pseudo-inertia."""
-    rows = np.zeros((10, 4, 4))
-    rows[0, 3, 3] = 1
-    for k in range(3):
-        rows[1 + k, k, 3] = 1
-    for row, (i, j) in zip(rows[4:], ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)), strict=True):
-        if i == j:
-            # tr(Sigma) is in every diagonal entry of tr(Sigma) 1 - Sigma.
-            row[np.arange(3), np.arange(3)] = 1
-        row[i, j] -= 1
-    return rows
-
-
-# Traces of products of these are the curvature of the divergence along straight lines in x: tr(P^-1 dP P^-1 dP).
-LOG_CHOLESKY_BASIS, FROM_PSEUDO = _log_cholesky_basis(), _from_pseudo()
-# Entries (10, 4, 4) of a factor over exp(alpha): those of the coordinates after alpha, and the last one, which is 1.
 _FACTORS = np.zeros((10, 4, 4))
 for _k, _place in enumerate([*LOG_CHOLESKY_PLACES, (3, 3)]):
     _FACTORS[(_k, *_place)] = 1
+# d(U U^T) = dU + dU^T at U = 1, for the derivatives dU of `inertia.log_cholesky_factor`; the first coordinate scales all of U.
+# Traces of products of these are the curvature of the divergence along straight lines in x: tr(P^-1 dP P^-1 dP).
+LOG_CHOLESKY_BASIS = np.concatenate([np.eye(4)[None], _FACTORS[:9]])
+LOG_CHOLESKY_BASIS = LOG_CHOLESKY_BASIS + np.swapaxes(LOG_CHOLESKY_BASIS, 1, 2)
+# The linear map (10, 4, 4) of `inertia.parameters_from_pseudo`.
+FROM_PSEUDO = np.stack([host_math.parameters_from_pseudo(unit) for unit in np.eye(16).reshape(16, 4, 4)], axis=1)
+FROM_PSEUDO = FROM_PSEUDO.reshape(10, 4, 4)
 
 
 class Chart(eqx.Module):

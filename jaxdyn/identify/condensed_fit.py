@@ -307,41 +307,47 @@ def intervals(
     for term, number in data.counts.items():
         for k in range(number):
             names += [f"{joint}.{term}{k + 1 if number > 1 else ''}" for joint in coordinate_names(model)]
+    extra, places = data.places(setting.extra), np.arange(blocks.size)
     fitted = np.concatenate([free, np.zeros(blocks.size - len(free), bool)])
-    fitted[data.places(setting.extra)] = True
-    shown = np.flatnonzero(fitted | (np.arange(blocks.size) < data.basic))
+    fitted[extra] = True
     # Covariances of independent errors suffice for ratios of variances, and have less scatter than those of few groups.
-    extra = data.places(setting.extra)
     covariance = jacobian @ inverse @ jacobian.T
     # All terms, extra ones too, are vectors of nv numbers after the inertias.
-    is_still = (np.arange(blocks.size) >= 10 * nb) & np.isin((np.arange(blocks.size) - 10 * nb) % nv, list(still))
+    is_still = (places >= 10 * nb) & np.isin((places - 10 * nb) % nv, list(still))
+
+    def describe(names, rows, known, is_still, is_confounded) -> Spread:
+        """Spread of linear combinations `rows` (m, p) of the parameters."""
+        is_lost = depends_on(rows @ jacobian, null) & ~is_still
+        marks = np.select([is_lost, is_still, is_confounded], [UNDETERMINED, STILL, CONFOUNDED], "")
+        from_data, from_prior = np.sum((rows @ changes) ** 2, axis=1), np.sum((rows @ pulled) ** 2, axis=1)
+        total = from_data + from_prior
+        # A number that no free coordinate changes keeps its nominal value, so that the prior is its source.
+        share = np.where(total > 0, from_prior / np.where(total > 0, total, 1), 1.0)
+        # NaN marks terms held at zero: at a bound there is no two-sided deviation.
+        std = np.where(known & ~is_lost, np.sqrt(total), np.nan)
+        return Spread(tuple(names), rows @ estimate.x, std, share, marks)
 
     # Torques determine combinations; single inertial numbers in them depend on the prior as well.
     base = base_parameters(model, terms)
     columns = free_columns(nb, nv, terms)
     combine = np.zeros((len(base), blocks.size))
     combine[:, columns] = base.matrix
-    is_confounded = share_of_extra(np.eye(blocks.size), covariance, extra) > _FROM_EXTRA
+    unit = np.eye(blocks.size)
+    is_confounded = share_of_extra(unit, covariance, extra) > _FROM_EXTRA
     for place in extra:
         # The share of an extra coefficient in its own variance is 1: it counts by what it takes from the base parameters instead.
         is_confounded[place] = np.any(share_of_extra(combine, covariance, np.array([place])) > _FROM_EXTRA)
-    is_lost = depends_on(jacobian, null) & ~is_still
-    marks = np.select([is_lost, is_still, is_confounded], [UNDETERMINED, STILL, CONFOUNDED], "")
-    fitted &= ~is_lost
-    parameters = _make_spread(
-        [names[i] for i in shown], estimate.x[shown], changes[shown], pulled[shown], fitted[shown], marks[shown]
-    )
-
+    shown = np.flatnonzero(fitted | (places < data.basic))
+    marked = [x[shown] for x in (unit, fitted, is_still, is_confounded)]
+    parameters = describe([names[i] for i in shown], *marked)
+    fitted &= ~(depends_on(jacobian, null) & ~is_still)
     # By absolute values: parameters enter with both signs, and a sum over them can vanish where none is zero.
     enters = np.abs(base.matrix) > 1e-9 * np.abs(base.matrix).max(axis=1, keepdims=True)
-    is_still = is_still[columns[base.independent]]
-    is_lost = depends_on(combine @ jacobian, null) & ~is_still
-    known = np.any(enters & fitted[columns], axis=1) & ~is_lost
-    a, b = base.matrix @ changes[columns], base.matrix @ pulled[columns]
+    known = np.any(enters & fitted[columns], axis=1)
     is_confounded = share_of_extra(combine, covariance, extra) > _FROM_EXTRA
-    marks = np.select([is_lost, is_still, is_confounded], [UNDETERMINED, STILL, CONFOUNDED], "")
-    spread = _make_spread(base.names, base.values(estimate.x[columns]), a, b, known, marks)
-    return Intervals(parameters, spread, base, a @ a.T + b @ b.T, factor, widening)
+    combinations = describe(base.names, combine, known, is_still[columns[base.independent]], is_confounded)
+    a, b = combine @ changes, combine @ pulled
+    return Intervals(parameters, combinations, base, a @ a.T + b @ b.T, factor, widening)
 
 
 def share_of_extra(rows: np.ndarray, covariance: np.ndarray, extra: np.ndarray) -> np.ndarray:
@@ -358,15 +364,6 @@ def share_of_extra(rows: np.ndarray, covariance: np.ndarray, extra: np.ndarray) 
     cross = rows @ covariance[:, extra]
     inverse = np.linalg.pinv(covariance[np.ix_(extra, extra)], hermitian=True)
     return np.einsum("ie,ef,if->i", cross, inverse, cross) / np.where(variance > 0, variance, np.inf)
-
-
-def _make_spread(names, values, changes, pulled, fitted, marks) -> Spread:
-    from_data, from_prior = np.sum(changes**2, axis=1), np.sum(pulled**2, axis=1)
-    total = from_data + from_prior
-    # A number that no free coordinate changes keeps its nominal value, so that the prior is its source.
-    share = np.where(total > 0, from_prior / np.where(total > 0, total, 1), 1.0)
-    # NaN marks terms held at zero: at a bound there is no two-sided deviation.
-    return Spread(tuple(names), np.asarray(values), np.where(fitted, np.sqrt(total), np.nan), share, marks)
 
 
 def local_coordinates(data: Data, setting: Setting, estimate: Estimate):

@@ -1,7 +1,6 @@
 """Exciting motions: periodic, within limits, with information about the parameters maximised by gradient descent."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -191,11 +190,12 @@ def exciting_motion(
     lengths = np.linalg.norm(_rows(motions[0], task, places), axis=0)
     # One scale for all starts makes their losses comparable.
     task = eqx.tree_at(lambda t: t.scale, task, jnp.asarray(np.where(lengths > 0, lengths, 1), dtype))
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *map(_amplitudes, motions))
-    first = np.asarray(_losses(stacked, motions[0], task, places, objective))
+    args = motions[0].period, task, places, objective
+    scaled = [_scale_amplitudes(_amplitudes(motion), 1 / task.span) for motion in motions]
+    first = np.asarray(_losses(jax.tree.map(lambda *x: jnp.stack(x), *scaled), args))
     motion = motions[int(np.argmin(np.where(np.isfinite(first), first, np.inf)))]
 
-    excitation, history, result = _descend(motion, task, places, objective, steps, learning_rate, seed, callback)
+    excitation, history, result = _descend(motion, args, steps, learning_rate, seed, callback)
     excitation = _shrink(excitation, task)
     before, after = (np.asarray(_rows(m, task, places), np.float64) for m in (motion, excitation))
     scale = np.asarray(task.scale, np.float64)
@@ -273,8 +273,11 @@ def _regressor(task: _Task, places: tuple[int, ...], q, v, a, N):
 
 
 @eqx.filter_jit
-def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...], objective: str):
-    q, v, a, tau, N, gap = joint_signals(motion_from_rest(*amplitudes, period=motion.period), task.robot, task.times)
+def _loss(scaled, args):
+    """Loss of a motion by its centre and amplitudes in units of half of the ranges."""
+    period, task, places, objective = args
+    motion = motion_from_rest(*_scale_amplitudes(scaled, task.span), period=period)
+    q, v, a, tau, N, gap = joint_signals(motion, task.robot, task.times)
     W = _regressor(task, places, q, v, a, N) / task.scale[None]
     size = W.shape[1]
     # The floor keeps the logarithm finite where a motion does not excite a direction at all.
@@ -304,33 +307,23 @@ def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...
 
 
 @eqx.filter_jit
-def _losses(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...], objective: str):
+def _losses(scaled, args):
     """Losses (k,) of several motions."""
-    return jax.vmap(lambda one: _loss(one, motion, task, places, objective))(amplitudes)
+    return jax.vmap(lambda one: _loss(one, args))(scaled)
 
 
-def _losses_of_units(args, scaled):
-    span, motion, *rest = args
-    return _losses(_scale_amplitudes(scaled, span), motion, *rest)
-
-
-def _unit_loss(scaled, args):
-    span, motion, *rest = args
-    return _loss(_scale_amplitudes(scaled, span), motion, *rest)
-
-
-def _descend(motion, task, places, objective, steps, learning_rate, seed, callback):
+def _descend(motion, args, steps, learning_rate, seed, callback):
     import optax  # not when jaxdyn is imported
 
-    args = (task.span, motion, task, places, objective)
+    task = args[1]
     if task.robot.motors is None:
         adam = optax.adam(optax.cosine_decay_schedule(learning_rate, steps, alpha=0.05))
-        method = GradientSteps(_unit_loss, args, method=adam)
+        method = GradientSteps(_loss, args, method=adam)
     else:
         # Higher harmonics have smaller amplitudes at the same speed.
         shares = 1 / np.arange(1.0, 1 + len(motion.sine))[:, None]
         sizes = tuple(5 * learning_rate * x for x in (1.0, shares, shares))
-        method = RandomSteps(partial(_losses_of_units, args), sizes, seed)
+        method = RandomSteps(lambda points: _losses(points, args), sizes, seed)
     report = None if callback is None else lambda step, loss, _: callback(step, loss)
     end = descend(method, _scale_amplitudes(_amplitudes(motion), 1 / task.span), Watch(steps, report))
     found = _scale_amplitudes(end.best.point, task.span)

@@ -135,11 +135,20 @@ class LinearChart(NamedTuple):
         return np.concatenate([inertial, R[:, self.term_places] * self.scale], axis=1)
 
 
+def term_units(sizes) -> dict[str, np.ndarray]:
+    """Units (nv,) of `TERMS`: a tenth of a joint's torque, over velocity or acceleration; `sizes` as of `signal_sizes`."""
+    torque, velocity, acceleration = (np.asarray(x, np.float64) for x in sizes)
+    unit, one = 0.1 * torque, np.ones_like(torque)
+    # A torque that is always zero borrows the largest unit: a term in units of zero could not be changed.
+    unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
+    per = {"viscous": velocity, "coulomb": one, "offset": one, "armature": acceleration}
+    return {term: unit / np.where(size > 0, size, 1.0) for term, size in per.items()}
+
+
 def robot_chart(model: Model, terms: tuple[str, ...], inertia: str, sizes) -> LinearChart:
     """Chart of all parameters x (10 nb + 4 nv,) of a robot, by its bodies with mass and some of `TERMS`.
 
-    Terms are in units of a tenth of a joint's torque, that torque over the velocity or over the acceleration, and start at the
-    model's own, a tenth of a unit where it has none.
+    Terms are in `term_units`, and start at the model's own, a tenth of a unit where it has none.
 
     **Arguments:** `inertia`, "full", "mass" or "fixed"; `sizes`, as of `signal_sizes`.
 
@@ -154,12 +163,8 @@ def robot_chart(model: Model, terms: tuple[str, ...], inertia: str, sizes) -> Li
         raise ValueError(
             f"{terms[row]} of coordinate {column} is {own[row * model.nv + column]} in the model; it must not be negative"
         )
-    torque, velocity, acceleration = (np.asarray(x, np.float64) for x in sizes)
-    unit = 0.1 * torque
-    # A torque that is always zero borrows the largest unit: a term in units of zero could not be changed.
-    unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
-    per = {"viscous": velocity, "coulomb": np.ones(model.nv), "offset": np.ones(model.nv), "armature": acceleration}
-    scale = np.concatenate([np.zeros(0), *(unit / np.where(per[term] > 0, per[term], 1.0) for term in terms)])
+    units = term_units(sizes)
+    scale = np.concatenate([np.zeros(0), *(units[term] for term in terms)])
     given[places] = given[term_places] = 0.0
     # At a bound a barrier is infinite: start inside.
     start = np.where(positive, np.where(own > 0, own / scale, 0.1), 0.0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify.descent import on_one_thread
+from jaxdyn.identify.interior import term_units
 from jaxdyn.identify.logs import Log, as_logs, check_log, signal_sizes
 from jaxdyn.identify.mechanisms import check_motors, motor_regressor
 from jaxdyn.identify.options import Objective
@@ -31,7 +32,7 @@ from jaxdyn.identify.regression import (
     triangle_of,
 )
 from jaxdyn.identify.result import Fit, torques_along
-from jaxdyn.identify.torque_terms import LEAVES, TERMS, Friction, Terms, check_terms
+from jaxdyn.identify.torque_terms import LEAVES, POSITIVE, TERMS, Friction, Terms, check_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
@@ -381,21 +382,13 @@ def fit_mechanism(
 
 def _with_friction(scene: Scene, motors: np.ndarray, terms, v_s: float, sizes) -> Scene:
     """Scene with one force for the friction of all joints, of which that of the motors is positive, as a fit's start must be."""
-    model, zero = scene.system, np.zeros(scene.nv)
-    torque, velocity, acceleration = sizes
-    # A hundredth of the torque where the file has none: a logarithm needs a start above zero.
-    unit = 0.01 * torque
-    start = {"viscous": model.damping, "coulomb": model.friction, "armature": model.armature}
-    per = {"viscous": velocity, "coulomb": np.ones(scene.nv), "armature": acceleration}
-    for term, own in start.items():
-        own = zero.copy() if own is None else np.array(own, np.float64)
-        if term in terms:
-            least = unit / np.where(per[term] > 0, per[term], 1.0)
-            own[motors] = np.where(own[motors] > 0, own[motors], least[motors])
-        start[term] = own
-    dtype = model.home.dtype
-    viscous, coulomb, armature = (jnp.asarray(start[term], dtype) for term in ("viscous", "coulomb", "armature"))
-    friction = Friction(viscous, coulomb, jnp.asarray(zero, dtype), jnp.asarray(v_s, dtype))
+    model, units = scene.system, term_units(sizes)
+    start = dict(zip(TERMS, nominal_parameters(model)[10 * model.nb :].reshape(-1, model.nv), strict=True))
+    for term in set(terms) & set(POSITIVE):
+        # A hundredth of the torque where the file has none: a logarithm needs a start above zero.
+        start[term][motors] = np.where(start[term] > 0, start[term], 0.1 * units[term])[motors]
+    viscous, coulomb, offset, armature = (jnp.asarray(start[term], model.home.dtype) for term in TERMS)
+    friction = Friction(viscous, coulomb, offset, jnp.asarray(v_s, model.home.dtype))
     others = [force for force in scene.forces if not isinstance(force, (JointDamping, CoulombFriction))]
     rotors = armature if model.armature is not None or "armature" in terms else None
     moved = Scene(model.replace(armature=rotors), scene.constraints, [friction, *others])

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import warn
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
 
 # Samples at each side that define the local motion of a joint around a sample or a jump.
@@ -298,22 +299,17 @@ def _angles(log: Log, model: Model | None) -> list[int]:
     return [where.start for kind, where in turning if kind in ("revolute", "continuous")]
 
 
-def _joint(model: Model, signal: str, column: int) -> int:
-    slices = model.topology.q_slices if signal == "q" else model.topology.v_slices
-    return next(i for i, where in enumerate(slices) if where.start <= column < where.stop)
-
-
 def _label(log: Log, model: Model | None, signal: str, column: int) -> str:
-    if model is not None and getattr(log, signal).shape[1] == (model.nq if signal == "q" else model.nv):
-        return f"joint {model.joint_names[_joint(model, signal, column)]}"
-    if log.joint_names is not None and getattr(log, signal).shape[1] == len(log.joint_names):
-        return f"joint {log.joint_names[column]}"
-    return f"joint {column + 1}"
+    sets = [] if model is None else [getattr(columns_of(model), "q" if signal == "q" else "v")]
+    sets += [] if log.joint_names is None else [log.joint_names]
+    count = getattr(log, signal).shape[1]
+    return f"joint {next((names[column] for names in sets if len(names) == count), column + 1)}"
 
 
 def _velocity_limit(model: Model | None, column: int) -> float:
     """Velocity limit of a column of q, infinite where it is unknown; files write 0 for none."""
     if model is None:
         return np.inf
-    limit = float(np.asarray(model.velocity_limit)[model.topology.v_slices[_joint(model, "q", column)].start])
+    slices = zip(model.topology.q_slices, model.topology.v_slices, strict=True)
+    limit = float(np.asarray(model.velocity_limit)[next(v.start for q, v in slices if q.start == column)])
     return limit if limit > 0 else np.inf

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.model.arguments import Checked, Numbers, is_concrete
-from jaxdyn.model.topology import KINDS
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
 
 # Columns that jump are evaluated on this many times the samples of a log before they are low-passed.
@@ -132,18 +132,18 @@ def check_log(log: Log, system, *, needs=("v", "a")) -> None:
         )
 
 
-def filter_like_log(log: Log, columns: np.ndarray, order: int = 4, factor: int = 1) -> np.ndarray:
+def filter_like_log(log: Log, columns: np.ndarray, factor: int = 1) -> np.ndarray:
     """Columns (n, ...) as the log's low-pass would have left them; unchanged for a log that was not filtered.
 
     `factor`: samples of the columns per sample of the log; every `factor`-th is returned.
     """
     cutoff = log.cutoff
-    if cutoff is None or not _has_filter(log, order):
+    if cutoff is None or not _has_filter(log):
         return columns if factor == 1 else columns[::factor]
     if not columns.size:
         return columns[::factor]
     # The refined samples have a higher rate: the cut-off stays the same in Hz.
-    return low_pass(columns, factor * log_rate(log), cutoff, order)[::factor]
+    return low_pass(columns, factor * log_rate(log), cutoff)[::factor]
 
 
 def low_pass(x: np.ndarray, rate: float, cutoff: float, order: int = 4) -> np.ndarray:
@@ -185,8 +185,8 @@ def refine_samples(samples: np.ndarray, factor: int) -> np.ndarray:
     return CubicSpline(np.arange(len(samples)), samples)(places)
 
 
-def _has_filter(log: Log, order: int = 4) -> bool:
-    shortest = 3 * (order + 1) + 1
+def _has_filter(log: Log) -> bool:
+    shortest = 16  # of SciPy's default padding for a filter of fourth order
     # Near the Nyquist frequency, half the sampling rate, there is no band left to remove; above it no filter exists.
     return log.cutoff is not None and log.cutoff < 0.45 * log_rate(log) and len(log) >= shortest
 
@@ -287,7 +287,4 @@ def idle_coordinates(model: Model, logs: Sequence[Log]) -> tuple[int, ...]:
 
 def are_angles(model: Model) -> np.ndarray:
     """Mask (nv,) of the coordinates that are angles."""
-    linear = {"prismatic": (True,), "planar": (True, True, False), "free": (True,) * 3 + (False,) * 3}
-    return ~np.concatenate(
-        [np.array(linear.get(kind, (False,) * KINDS[kind].nv), bool) for kind in model.topology.kinds]
-    )
+    return np.array([unit == "rad/s" for unit in columns_of(model).v_units])

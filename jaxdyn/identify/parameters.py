@@ -1,6 +1,7 @@
 """Fit of any numbers of any system or scene by the error of torques, balances or simulated motion."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.identify.mechanisms import FitSystem
 from jaxdyn.identify.methods import (
     DAMPING,
+    RANK_TOLERANCE,
     SOLVERS,
     GaussNewton,
     GradientSteps,
@@ -28,7 +30,7 @@ from jaxdyn.identify.methods import (
     propose,
     with_prior,
 )
-from jaxdyn.identify.options import GAUSS_NEWTON, Execution, Objective, Solver, merge_options
+from jaxdyn.identify.options import BALANCES, GAUSS_NEWTON, Execution, Objective, Solver, merge_options
 from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.problem import (
     NumbersAt,
@@ -42,10 +44,11 @@ from jaxdyn.identify.problem import (
     numbers_at,
     on_one_device,
     pose_problem,
+    segment_starts,
 )
-from jaxdyn.identify.regression import Blocks, triangle_of
+from jaxdyn.identify.regression import Blocks, block_slices, least_squares_by_svd, triangle_of
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.uncertainty import ErrorRows, standard_deviations, student
+from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, jackknife, student
 from jaxdyn.model.arguments import Checked, Function
 from jaxdyn.tasks import count_workers, map_tasks
 
@@ -53,6 +56,8 @@ from jaxdyn.tasks import count_workers, map_tasks
 _EXCESS = 1e-9
 # Of the starts: rough, as the best one is fitted to the end afterwards, so that only the order of the losses matters.
 _STEPS, _TOLERANCE = 20, 1e-4
+# About so many blocks are cut from all logs of a fit; each log has at least one.
+_BLOCKS = 20
 
 
 @on_one_thread
@@ -143,15 +148,16 @@ def fit_parameters(
 
 
 class Minimum(NamedTuple):
-    """Errors of the data near a minimum, condensed, and in full (n,); `prior` (k, p): rows of the prior, of unit deviation.
+    """Errors of the data near a minimum (n,), `width` in a row, and the log (rows,) of each row; `prior` (k, p): its rows.
 
-    `layout`: rows of the errors; `used`: errors that initial states have used up; `numbers` there, if known. No `blocks` for
-    errors that are not finite.
+    `blocks`: errors + rows y, condensed, by blocks of whole segments where there are enough of these; None for errors that are
+    not finite. `used`: errors that initial states have used up; `numbers` there, if known.
     """
 
-    layout: ErrorRows
-    blocks: Blocks | None
     errors: np.ndarray
+    width: int
+    log: np.ndarray
+    blocks: Blocks | None
     prior: np.ndarray
     used: int = 0
     numbers: NumbersAt | None = None
@@ -160,17 +166,79 @@ class Minimum(NamedTuple):
     def of(cls, problem: Problem, logs: Sequence[Log], linear: LinearErrors) -> "Minimum":
         """Condense linear errors."""
         count = len(linear.errors) - linear.priors
-        layout, errors = ErrorRows.of(problem, logs, count), linear.errors[:count]
-        blocks = layout.condense(linear.rows[:count], errors) if linear.is_finite else None
-        return cls(layout, blocks, errors, linear.rows[count:] / linear.prior_weight**0.5, linear.start_rank)
+        owners = np.array([log for log, _ in segment_starts(problem, logs)])
+        # A balance has one row of errors for a segment, other errors one for each sample.
+        is_balance = problem.objective.error in BALANCES
+        of_segment = np.concatenate(
+            [np.full(batch.t.shape[0], 1 if is_balance else batch.t.shape[1]) for batch in problem.batches]
+        )
+        log = np.repeat(owners, of_segment)
+        errors, width, blocks = linear.errors[:count], count // len(log), None
+        if linear.is_finite:
+            # A unit is what a block cannot divide: a segment, or a row of one.
+            whole = len(owners) >= _BLOCKS
+            lengths = np.bincount(owners if whole else log)
+            slices = block_slices(lengths[lengths > 0].tolist(), _BLOCKS)
+            # The first unit, and then the first row, of each block, and the end.
+            ends = np.cumsum([0, *(part.stop - part.start for _, part in slices)])
+            ends = np.append(0, np.cumsum(of_segment))[ends] if whole else ends
+            table = np.concatenate([linear.rows[:count], -errors[:, None]], axis=1)
+            tables = [table[width * a : width * b] for a, b in itertools.pairwise(ends)]
+            triangles = [[x if len(x) <= x.shape[1] else triangle_of(x)] for x in tables]
+            p = linear.rows.shape[1]
+            blocks = Blocks(triangles, (np.arange(p),), p, width * np.diff(ends), log[ends[:-1]])
+        return cls(errors, width, log, blocks, linear.rows[count:] / linear.prior_weight**0.5, linear.start_rank)
 
     def deviations(self, jacobian: np.ndarray) -> tuple[np.ndarray, float]:
-        """Standard deviations (m,) of numbers with the Jacobian (m, p), and the factor of a 95 % interval."""
-        if self.blocks is None:
+        """Standard deviations (m,) of numbers with the Jacobian (m, p) by y, and the factor of a 95 % interval.
+
+        The larger of two: that of independent errors of equal size, and that of a jackknife over groups, which accounts for
+        errors that are autocorrelated, correlated among coordinates, and larger at some samples. A few groups estimate a
+        deviation badly, and a number that a single group determines has no scatter over groups; the other one is then a lower
+        bound. Errors of the data have one size, which is estimated from them; errors of the prior have the size that it states.
+        Infinite where neither data nor prior determine a number, NaN where errors are no more than the unknowns.
+
+        Source: Bell & McCaffrey (2002), CR3; Angrist & Pischke (2009), "Mostly harmless econometrics", section 8.2, the maximum.
+        """
+        blocks, prior = self.blocks, self.prior
+        if blocks is None:
             return np.full(len(jacobian), np.nan), np.nan
-        groups = self.layout.groups(self.errors)
-        deviations = standard_deviations(self.blocks, groups, self.prior, jacobian, self.used)
-        return deviations, student(max(len(groups) - 1, 1))
+        # The order of samples within a log is needed here: the autocorrelation is one along time.
+        table = self.errors.reshape(len(self.log), self.width)
+        groups = block_groups(len(blocks), effective_sample_size([table[self.log == k] for k in np.unique(self.log)]))
+        factor = student(max(len(groups) - 1, 1))
+        whole, count = triangle_of(blocks.rows(np.ones(1))), blocks.count() - self.used
+        data = whole[:, :-1]
+        if len(prior) == 0:
+            count -= least_squares_by_svd(data, np.zeros(len(data)), RANK_TOLERANCE).rank
+        if count <= 0:
+            return np.full(len(jacobian), np.nan), factor
+        # The estimated variance of errors; for errors that are all zero the smallest number keeps the division defined.
+        noise = (max(float(np.sum(whole[:, -1] ** 2)), 1e-300) / count) ** 0.5
+        rows = np.concatenate([data / noise, prior])
+        # Columns of unit length: ranks must not depend on units of the parameters.
+        size = np.linalg.norm(rows, axis=0)
+        size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
+        # The triangle has the singular values of all rows. The full Vt holds the null space where rows are fewer than columns.
+        _, s, Vt = np.linalg.svd(triangle_of(rows / size), full_matrices=True)
+        rank = int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
+        # No error depends on these coordinates: a number with a share in them is not determined.
+        unseen = np.isinf(size)
+        scaled = jacobian / np.where(unseen, 1.0, size)
+        seen = np.where(unseen[None], 0.0, scaled)
+        # A number with any share in the null space of data and prior is not determined.
+        is_free = np.linalg.norm(seen @ Vt[rank:].T, axis=1) > 1e-6 * np.linalg.norm(seen, axis=1)
+        is_free |= np.abs(scaled[:, unseen]).sum(axis=1) > 0
+        # In whitened coordinates data and prior together have the curvature 1, the covariance for independent errors.
+        whitening = Vt[:rank].T / s[:rank] / size[:, None]
+        numbers, prior = seen @ (Vt[:rank].T / s[:rank]), prior @ whitening
+        parts = [np.concatenate([blocks.triangles[k][0] for k in group]) / noise for group in groups]
+        parts = [(part[:, :-1] @ whitening, -part[:, -1]) for part in parts]
+        grams = np.stack([part.T @ part for part, _ in parts])
+        root = jackknife(grams, np.stack([part.T @ error for part, error in parts]), prior.T @ prior).root
+        # Errors of the prior have the size that it states: their part needs no estimate from scatter.
+        variance = np.sum((numbers @ root) ** 2, axis=1) + np.sum((numbers @ prior.T) ** 2, axis=1)
+        return np.where(is_free, np.inf, np.sqrt(np.maximum(variance, np.sum(numbers**2, axis=1)))), factor
 
 
 def _minimise(

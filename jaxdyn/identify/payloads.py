@@ -37,7 +37,7 @@ from jaxdyn.identify.regression import (
     noise_level,
     triangle_of,
 )
-from jaxdyn.identify.result import Fit
+from jaxdyn.identify.result import Fit, residuals
 from jaxdyn.identify.robot import RobotFit, fit_robot
 from jaxdyn.identify.selection import VELOCITIES
 from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, check_terms, coulomb_through_filter, split_terms
@@ -408,18 +408,15 @@ def fit_payload(
     carried = [holds * W[:, :, own] for W, holds in zip(regressors, is_loaded, strict=True)]
     logs, payload, inertias = (*unloaded, *loaded), np.zeros(10), robot.fit.model.inertias
 
-    def errors(fit: Fit, logs: Sequence[Log]) -> list[np.ndarray]:
-        return [fit.torques(log) - np.asarray(log.tau, np.float64) for log in logs]
-
     def hold(payload) -> Fit:
         heavier = inertias.at[number].add(jnp.asarray(payload, inertias.dtype))
         return eqx.tree_at(lambda fit: fit.system.system.inertias, robot.fit, heavier)
 
     # Errors without the payload do not depend on it: computed once.
-    residuals = errors(robot.fit, unloaded)
+    own_errors = residuals(robot.fit, unloaded)
 
     def size(payload) -> float:
-        return effective_sample_size([*residuals, *errors(hold(payload), loaded)])
+        return effective_sample_size([*own_errors, *residuals(hold(payload), loaded)])
 
     # The load of the gears depends on the payload, which is still zero in the first round.
     has_loads, result = any(term.needs_load for term in extra), RESULTS.max_steps_reached
@@ -436,7 +433,7 @@ def fit_payload(
             break
     percent = 100 / np.linalg.norm(np.concatenate([np.asarray(log.tau, np.float64) for log in loaded]))
     error, without = (
-        float(percent * np.linalg.norm(np.concatenate(errors(fit, loaded)))) for fit in (hold(payload), robot.fit)
+        float(percent * np.linalg.norm(np.concatenate(residuals(fit, loaded)))) for fit in (hold(payload), robot.fit)
     )
     return Payload(payload, std, factor, body, robot, error, without, result)
 

@@ -379,12 +379,12 @@ def group_columns(W: np.ndarray, names: tuple[str, ...], nb: int, dtype: np.dtyp
     return BaseParameters(matrix, independent, names), rank
 
 
-def noise_level(triangle: np.ndarray, count: int, *, what: str = "the log", rcond: float = 1e-9) -> float:
+def noise_level(triangle: np.ndarray, count: int, *, what: str = "the log") -> float:
     """Root mean square residual of the unconstrained least squares of `count` torques, their noise; `what`, for the message.
 
     **Raises:** ValueError where the torques are no more than the regressor's rank: then the noise is not identifiable.
     """
-    fit = least_squares_by_svd(triangle[:, :-1], triangle[:, -1], rcond)
+    fit = least_squares_by_svd(triangle[:, :-1], triangle[:, -1], 1e-9)
     if count <= fit.rank:
         # Not the number of unknowns: a log of few rows determines as many combinations of them as it has rows.
         raise ValueError(

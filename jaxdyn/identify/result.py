@@ -405,6 +405,11 @@ class Fit(Outcome):
         return "\n".join(lines)
 
 
+def residuals(fit: Any, logs: Sequence[Log]) -> list[np.ndarray]:
+    """Errors (n, nv) of the torques of a fit along each of some logs."""
+    return [fit.torques(log) - np.asarray(log.tau, np.float64) for log in logs]
+
+
 def torques_along(scene: Scene, log: Log, motors: tuple[int, ...] | None = None) -> np.ndarray:
     """Torques (n, nv) that a scene needs along a log; of a mechanism those of its `motors`, zero elsewhere.
 

@@ -20,7 +20,7 @@ from jaxdyn.identify.log_repair import LogWarning
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.raw_logs import differentiate, log_warnings
 from jaxdyn.identify.regression import check_weights
-from jaxdyn.identify.result import Fit
+from jaxdyn.identify.result import Fit, residuals
 from jaxdyn.identify.robot_logs import RobotLogs, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, improving_torques, search, splits
 from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, TorqueTerm, candidates, check_terms, split_terms
@@ -301,8 +301,8 @@ def fit_robot(
         problem = RobotLogs(model, logs, basic, extra, inertia, blocks)
     estimate = problem.refine(setting, fixed)
     fit = problem.result(setting, estimate)
-    for number, one in enumerate(logs, 1):
-        for line in log_warnings(model, one, fit.torques(one) - np.asarray(one.tau, np.float64)):
+    for number, (one, errors) in enumerate(zip(logs, residuals(fit, logs), strict=True), 1):
+        for line in log_warnings(model, one, errors):
             warn(f"log {number}: {line}", LogWarning)
     if is_found and delays is not None and delays.seconds.any():
         spread, delays = with_delays(problem, setting, estimate, fit, delays)

@@ -22,7 +22,7 @@ from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.regression import free_columns, log_regressor, nominal_parameters, parameter_names, triangle_of
-from jaxdyn.identify.result import Fit
+from jaxdyn.identify.result import Fit, residuals
 from jaxdyn.identify.selection import find_shifts, include_shifts
 from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm, candidates
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white, model_error_factors
@@ -178,7 +178,7 @@ class RobotLogs:
     def intervals(self, setting: Setting, estimate: Estimate, fit: Fit, *, with_omitted: bool = True) -> Intervals:
         """Standard deviations of an estimate, which is this fit; `with_omitted`: including fits with terms that it lacks."""
         data, curved = self.data(setting), self.curvature_data(setting)
-        errors = [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
+        errors = residuals(fit, self.logs)
         size, widening = effective_sample_size(errors), model_error_factors(self.logs, errors)
         found = intervals(
             self.model, data, setting, estimate, self.weights, self.basic, size, widening, curved, self.still
@@ -213,8 +213,7 @@ class RobotLogs:
         self._rows = {key: rows for key, rows in self._rows.items() if key[1] != threshold}
 
     def _errors(self, setting: Setting, estimate: Estimate) -> list[np.ndarray]:
-        fit = self.result(setting, estimate)
-        return [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
+        return residuals(self.result(setting, estimate), self.logs)
 
     def _new_weights(self, setting: Setting, estimate: Estimate) -> np.ndarray:
         blocks = self.data(setting).blocks

@@ -10,17 +10,12 @@ for general stationary observations"; Bell & McCaffrey (2002), "Bias reduction i
 multi-stage samples", for the factor of the group left out; Priestley (1981), "Spectral analysis and time series", section 5.3.
 """
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxdyn.identify.logs import Log, log_rate
-from jaxdyn.identify.methods import RANK_TOLERANCE
-from jaxdyn.identify.options import BALANCES
-from jaxdyn.identify.problem import Problem, segment_starts
-from jaxdyn.identify.regression import Blocks, block_slices, least_squares_by_svd, triangle_of
 
 # Least numbers of blocks and of independent errors in a group, where these leave at least so many groups: squares of Student's t
 # have no variance below five degrees of freedom.
@@ -31,8 +26,6 @@ _LEVEL = 1e-3
 _STATES = 10
 # Eigenvalues of a Hessian of unit diagonal below the first are those of rounding errors; least relative change of a number.
 _ROUNDING, _LEAST_CHANGE = 1e-13, 1e-4
-# About so many blocks are cut from all logs of a fit of parameters; each log has at least one.
-_BLOCKS = 20
 
 
 def block_groups(count: int, size: float) -> list[np.ndarray]:
@@ -234,94 +227,3 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray
     excess = np.max(share - np.arange(1, count + 1)[:, None] / count, axis=0)
     # One-sided Kolmogorov-Smirnov bound: white noise exceeds x with the probability exp(-2 m x^2).
     return excess <= np.sqrt(-np.log(_LEVEL) / 2 / count)
-
-
-class ErrorRows(NamedTuple):
-    """Rows of the errors of a fit of parameters, `width` errors each: the block (rows,) and the log (rows,) of each.
-
-    Blocks consist of whole segments where there are enough of these.
-    """
-
-    block: np.ndarray
-    log: np.ndarray
-    width: int
-
-    @classmethod
-    def of(cls, problem: Problem, logs: Sequence[Log], count: int) -> "ErrorRows":
-        """Rows of the `count` errors of a problem's data."""
-        owners = np.array([log for log, _ in segment_starts(problem, logs)])
-        # A balance has one row of errors for a segment, other errors one for each sample.
-        is_balance = problem.objective.error in BALANCES
-        rows = [np.full(batch.t.shape[0], 1 if is_balance else batch.t.shape[1]) for batch in problem.batches]
-        of_segment = np.concatenate(rows)
-        log = np.repeat(owners, of_segment)
-        # A unit is what a block cannot divide: a segment, or a row of one.
-        whole = len(owners) >= _BLOCKS
-        lengths = np.bincount(owners if whole else log)
-        slices = block_slices(lengths[lengths > 0].tolist(), _BLOCKS)
-        block = np.repeat(np.arange(len(slices)), [part.stop - part.start for _, part in slices])
-        return cls(np.repeat(block, of_segment) if whole else block, log, count // len(log))
-
-    def condense(self, rows: np.ndarray, errors: np.ndarray) -> Blocks:
-        """Condense errors + rows y, by blocks, to those of one torque whose columns are all shared."""
-        table, block = np.concatenate([rows, -errors[:, None]], axis=1), np.repeat(self.block, self.width)
-        edges = np.flatnonzero(np.diff(block, prepend=-1, append=block[-1] + 1))
-        tables = [table[a:b] for a, b in itertools.pairwise(edges)]
-        triangles = [[x if len(x) <= x.shape[1] else triangle_of(x)] for x in tables]
-        p = rows.shape[1]
-        return Blocks(triangles, (np.arange(p),), p, np.diff(edges), self.log[edges[:-1] // self.width])
-
-    def groups(self, errors: np.ndarray) -> list[np.ndarray]:
-        """Blocks of each jackknife group: consecutive ones of a log, or whole logs where there are many."""
-        # The order of samples within a log is needed here: the autocorrelation is one along time.
-        table = errors.reshape(len(self.log), self.width)
-        size = effective_sample_size([table[self.log == k] for k in np.unique(self.log)])
-        return block_groups(int(self.block[-1]) + 1, size)
-
-
-def standard_deviations(
-    blocks: Blocks, groups: Sequence[np.ndarray], prior: np.ndarray, jacobian: np.ndarray, used: int = 0
-) -> np.ndarray:
-    """Standard deviations (m,) of numbers with the Jacobian (m, p) by y; infinite where neither data nor prior determine them.
-
-    The larger of two: that of independent errors of equal size, and that of a jackknife over groups, which accounts for errors
-    that are autocorrelated, correlated among coordinates, and larger at some samples. A few groups estimate a deviation
-    badly, and a number that a single group determines has no scatter over groups; the other one is then a lower bound. Errors
-    of the data have one size, which is estimated from them; errors of the prior, with the rows `prior` (k, p), have the size
-    that it states. `used`: errors that other unknowns have used up. NaN where errors are no more than the unknowns.
-
-    Source: Bell & McCaffrey (2002), CR3; Angrist & Pischke (2009), "Mostly harmless econometrics", section 8.2, the maximum.
-    """
-    ones, count = np.ones(1), blocks.count() - used
-    whole = triangle_of(blocks.rows(ones))
-    data = whole[:, :-1]
-    if len(prior) == 0:
-        count -= least_squares_by_svd(data, np.zeros(len(data)), RANK_TOLERANCE).rank
-    if count <= 0:
-        return np.full(len(jacobian), np.nan)
-    # The estimated variance of errors; for errors that are all zero the smallest number keeps the division defined.
-    noise = (max(float(np.sum(whole[:, -1] ** 2)), 1e-300) / count) ** 0.5
-    rows = np.concatenate([data / noise, prior])
-    # Columns of unit length: ranks must not depend on units of the parameters.
-    size = np.linalg.norm(rows, axis=0)
-    size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
-    # The triangle has the singular values of all rows. The full Vt holds the null space, where there are fewer rows than columns.
-    _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size, mode="r"), full_matrices=True)
-    rank = int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
-    # No error depends on these coordinates: a number with a share in them is not determined.
-    unseen = np.isinf(size)
-    scaled = jacobian / np.where(unseen, 1.0, size)
-    seen = np.where(unseen[None], 0.0, scaled)
-    # A number with any share in the null space of data and prior is not determined.
-    is_free = np.linalg.norm(seen @ Vt[rank:].T, axis=1) > 1e-6 * np.linalg.norm(seen, axis=1)
-    is_free |= np.abs(scaled[:, unseen]).sum(axis=1) > 0
-    # In whitened coordinates data and prior together have the curvature 1: the covariance for independent errors is the identity.
-    whitening = Vt[:rank].T / s[:rank] / size[:, None]
-    numbers, prior = seen @ (Vt[:rank].T / s[:rank]), prior @ whitening
-    parts = [np.concatenate([blocks.triangles[k][0] for k in group]) / noise for group in groups]
-    parts = [(part[:, :-1] @ whitening, -part[:, -1]) for part in parts]
-    grams = np.stack([part.T @ part for part, _ in parts])
-    root = jackknife(grams, np.stack([part.T @ error for part, error in parts]), prior.T @ prior).root
-    # Errors of the prior have the size that it states: their part needs no estimate from scatter.
-    variance = np.sum((numbers @ root) ** 2, axis=1) + np.sum((numbers @ prior.T) ** 2, axis=1)
-    return np.where(is_free, np.inf, np.sqrt(np.maximum(variance, np.sum(numbers**2, axis=1))))

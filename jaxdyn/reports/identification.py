@@ -21,7 +21,7 @@ from jaxdyn.identify import (
     torque_error,
 )
 from jaxdyn.identify.linear_fit import Identifiability
-from jaxdyn.identify.regression import free_columns
+from jaxdyn.identify.regression import coordinate_names, free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.identify.uncertainty import Whiteness, whiteness
 from jaxdyn.model.tree import Model
@@ -228,9 +228,7 @@ def payload_content(payload: Payload) -> dict[str, Any]:
 
 def model_joint(model: Model, coordinate: int) -> str:
     """Name of a coordinate of v: the joint's, with an index where it has several."""
-    # After ten parameters of each body, names of the first term are JOINT.term.
-    start = 10 * model.nb
-    return parameter_names(model)[start + coordinate].rpartition(".")[0]
+    return coordinate_names(model)[coordinate]
 
 
 def _errors(one: Evaluation) -> dict[str, Any]:

@@ -35,12 +35,6 @@ def motion_at(seed, t, waves=WAVES, size=1.0):
     return tuple(np.sum(amplitude * x, 1) for x in parts)
 
 
-def test_the_motion_of_the_witness_is_that_of_the_log():
-    log = motion(3)
-    for mine, other in zip(motion_at(3, log.t), (log.q, log.v, log.a), strict=True):
-        np.testing.assert_allclose(mine, other, atol=1e-12)
-
-
 @pytest.mark.long
 def test_delays_are_found_to_their_intervals():
     """12 ms at one joint, -5 ms at the other; and the robot's numbers come out as without delays."""

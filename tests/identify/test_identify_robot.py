@@ -596,17 +596,6 @@ def test_what_no_data_touch_is_from_the_prior(truth):
     assert np.isnan(fit.std[20:24][at_bound]).all() and np.isfinite(fit.std[20:24][~at_bound]).all()
 
 
-def test_two_halves_agree_within_their_intervals(truth):
-    model = arm()
-    log = measured(model, motion(4, 600, 12.0), truth, 0.1 * correlated(3, 600))
-    first, second = (
-        identify.fit_robot(model, part, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals.base
-        for part in identify.split(log, 0.5)
-    )
-    z = (first.values - second.values) / np.hypot(first.std, second.std)
-    assert np.sqrt(np.mean(z**2)) < 1.5
-
-
 def test_share_of_the_variance_that_extra_terms_cause():
     """Of a Gaussian with a known covariance, against the variances with the extra coefficient held fixed."""
     A = np.random.default_rng(0).normal(size=(30, 4))

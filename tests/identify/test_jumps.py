@@ -4,9 +4,10 @@ import warnings
 
 import numpy as np
 import pytest
-from scipy.io import loadmat
 
 import jaxdyn as jd
+from benchmarks.identify_franka import samples
+from benchmarks.identify_robots import kuka_samples
 from jaxdyn import identify
 from jaxdyn.cli import main
 from jaxdyn.identify import LogWarning
@@ -106,18 +107,6 @@ def test_wrapped_angles_give_the_fit_of_the_unwrapped_ones(clean, kind):
     reference = from_raw(clean)
     np.testing.assert_allclose(log.q, reference.q, atol=1e-10)
     np.testing.assert_allclose(fit_masses(log), fit_masses(reference), rtol=1e-10)
-
-
-def test_masses_of_two_and_one_kilogram(clean):
-    """What this module is for: left as they are, a wrap and a corrupted sample make nonsense of the masses."""
-    wrapped, corrupt = wrap(clean), change(clean, "q", 2500, 0, 80.0)
-    for log in (wrapped, corrupt):
-        nonsense = fit_masses(from_raw(log, unwrap=False, outliers="keep"))
-        assert np.abs(nonsense / MASSES - 1).max() > 0.5
-    with pytest.warns(LogWarning, match="unwrapped"):
-        np.testing.assert_allclose(fit_masses(from_raw(wrapped)), MASSES, rtol=2e-3)
-    with pytest.warns(LogWarning, match=r"1 corrupted sample left out and interpolated: q of joint shoulder \(1\)"):
-        np.testing.assert_allclose(fit_masses(from_raw(corrupt, outliers="drop")), MASSES, rtol=2e-3)
 
 
 def test_wraps_that_are_not_unwrapped_are_refused(clean):
@@ -292,26 +281,19 @@ def test_command_line(clean, tmp_path, capsys):
 
 
 def recorded(data_dir):
-    folder = data_dir / "franka_panda/matlab/data/Exciting_Traj/Trajectory_1/rbt_log"
-    if folder.is_dir():
-        t, q, tau = (np.loadtxt(folder / f"exciting_traj_{name}.txt") for name in ("time", "positions", "torques"))
-        yield identify.Log(t, q.reshape(-1, 7), tau=tau.reshape(-1, 7))
-    for name in "ABC":
-        path = data_dir / f"kuka_kr300/data/recorded_trajectories/2020-10-21 10s FF {name} 08ms/data.mat"
-        if path.is_file():
-            rec = loadmat(path, squeeze_me=True, struct_as_record=False)["rec"]
-            yield identify.Log(rec.time_cont, np.deg2rad(rec.act_pos_mot_deg.T), tau=rec.act_torque_abs_nm.T)
+    """The raw log of a Franka and three of a KUKA."""
+    try:
+        return [samples(data_dir), *(kuka_samples(data_dir, name) for name in "ABC")]
+    except SystemExit as missing:
+        pytest.skip(str(missing))
 
 
 @pytest.mark.long
 @pytest.mark.data
 def test_recorded_logs_are_left_alone(data_dir):
     """With noise, jitter and rounding added, parts of them, and with as few samples as hold the motion."""
-    logs = list(recorded(data_dir))
-    if not logs:
-        pytest.skip(f"no recorded arms at {data_dir}")
     generator = np.random.default_rng(3)
-    for log in logs:
+    for log in recorded(data_dir):
         for every in (1, 2, 3, 5, 10, 20):
             for part in (log[::every], log[: len(log) // 3 : every], log[len(log) // 2 :: every]):
                 t, q, tau = (np.asarray(x) for x in (part.t, part.q, part.tau))
