@@ -17,7 +17,6 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from jaxdyn.cli.common import output_path
 from jaxdyn.constraints.codes import CODES, name_of
-from jaxdyn.constraints.frames import constraint_forces
 from jaxdyn.simulation.solution import OF_DIFFRAX, from_diffrax
 
 ARM = jd.robots.chain(2)
@@ -72,7 +71,7 @@ OF_SYSTEMS = {
 OF_SCENES = {
     "assemble": (lambda s, q, v: jd.assemble(s, q, v).q, Q, V),
     "constrained_dynamics": (lambda s, q, v, tau: jd.constrained_dynamics(s, q, v, tau).acceleration, Q, V, A),
-    "constraint_forces": (lambda s, q, lam: list(constraint_forces(s, q, lam).values()), Q, NU),
+    "constraint_forces": (lambda s, q, lam: list(jd.constraint_forces(s, q, lam).values()), Q, NU),
     "constraint_jacobian": (jd.constraint_jacobian, Q),
     "gauge_invariant": (lambda s, q, v, tau: jd.reduction.gauge_invariant(s, q, v, tau).acceleration, Q, V, A),
     "involutive": (lambda s, q: jd.reduction.involutive(s, q).singular_values, Q),
@@ -189,7 +188,7 @@ def test_a_batch_without_vmap_is_told_so():
     with pytest.raises(ValueError, match=r"nu has shape \(4, 1\).*jax\.vmap"):
         jd.reduced_dynamics(CHAIN, Q, jnp.ones((4, 1)), basis=(0,))
     with pytest.raises(ValueError, match=r"multipliers has shape \(4, 1\).*jax\.vmap"):
-        constraint_forces(CHAIN, Q, jnp.ones((4, 1)))
+        jd.constraint_forces(CHAIN, Q, jnp.ones((4, 1)))
     with pytest.raises(ValueError, match=r"stepsize has shape \(2,\).*jax\.vmap"):
         jd.simulate(ARM, [0, 0], [0, 0], [0, 1], stepsize=[0.1, 0.2])
 
