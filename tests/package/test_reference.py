@@ -250,31 +250,3 @@ def test_tables_describe_all_arguments_and_no_others():
         if not row.text
     ]
     assert not empty and not unknown, "\n".join([*empty, *unknown])
-
-
-def test_what_a_docstring_leaves_to_another_one_is_found_there():
-    given = [argument_tables.Argument(name, "", None) for name in ("tol", "steps")]
-    known = argument_tables.descriptions(
-        {
-            "jd.a.fit": ("**Arguments:** as of `solve`, and\n\n- `steps`: at most.\n\n**Returns:** x.", given),
-            "jd.a.solve": ("**Arguments:** `tol`: of the residual.", given[:1]),
-            "jd.b.check": ("**Arguments:** as of `a.fit`.", given),
-        }
-    )
-    assert known["jd.b.check"] == known["jd.a.fit"] == {"tol": "of the residual.", "steps": "at most."}
-
-
-def test_tables_of_arguments_keep_names_shapes_and_groups():
-    arguments = [
-        argument_tables.Argument(name, "Float[Array, ' nq'] | None", None) for name in ("model", "q", "v", "t")
-    ]
-    general, table = argument_tables.rows("as of `f`; `q` (nq,), `v` (nv,): the state. `t`, s.", arguments)
-    assert general == "as of `f`;"
-    shown = [([name for _, name in row.arguments], row.text) for row in table]
-    assert shown == [
-        (["`model`"], "the bodies and joints."),
-        (["`q` (nq,)", "`v` (nv,)"], "the state."),
-        (["`t`"], "time, s."),
-    ]
-    assert argument_tables.readable("Float[Array, ' nq'] | None") == "array (nq,) | None"
-    assert argument_tables.readable("Checked[Float[Array, ...] | None]") == "array | None"
