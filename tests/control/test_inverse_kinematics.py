@@ -157,7 +157,7 @@ def velocity_slots(model, names):
     return np.array([model.topology.q_slices[model.joint_names.index(name)].start for name in names])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_delta_robot_in_a_batch():
     scene, guess = delta()
     rng = np.random.default_rng(0)

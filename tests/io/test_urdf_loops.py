@@ -163,7 +163,7 @@ def test_joints_in_gazebo_elements_close_loops(tmp_path, kind, loop, axes, rows)
         np.testing.assert_allclose(*open_by, rtol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rounding_out_of_the_plane_takes_no_freedom(tmp_path):
     """The axes of a planar linkage agree to rounding; their two rows are dependent and not two more."""
     scene = jd.load(

@@ -419,7 +419,7 @@ def test_block_slides_until_it_stops():
     assert_close(one_way_block(1.7, -1).applied_force(q0, -v0), [0.3 * 1.7 * G], 1e-15)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_block_sticks_where_it_stops():
     """Said by an event, at the time of the closed form; steps of fixed length end there too."""
     stop, ts = 2.0 / (0.3 * G), jnp.asarray([0.0, 0.5, 2.0])
