@@ -10,7 +10,7 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.cli import main
 from jaxdyn.constraints.base import position_residual
-from jaxdyn.identify.applied_fits import fit_mechanism
+from jaxdyn.identify.linear_fit import fit_mechanism
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.result import Segments, simulate_segment
 
