@@ -195,9 +195,7 @@ def test_centre_of_mass_coordinates_of_one_body():
 
 def test_centre_of_mass_coordinates_refuse_other_trees():
     arm = jd.robots.chain(2)
-    with pytest.raises(
-        ValueError, match=r"com_dynamics: the roots of model .* are .*\(revolute\); give a model with one root"
-    ):
+    with pytest.raises(ValueError, match=r"com_dynamics: the roots of model .* are .*\(revolute\)"):
         jd.dynamics.com_dynamics(arm, jnp.zeros(2), jnp.zeros(2))
     model = random_tree(44, ["free", "revolute"])
     if model.armature is not None:

@@ -144,7 +144,7 @@ def test_joints_name_the_frames_of_their_bodies():
     for joint, body in zip(model.joint_names, model.body_names, strict=True):
         assert joint not in model.frame_names
         np.testing.assert_array_equal(kinematics.frame_pose(model, q, joint), kinematics.frame_pose(model, q, body))
-    with pytest.raises(ValueError, match="axes is 'local'; choose from world, body"):
+    with pytest.raises(ValueError, match="axes is 'local'"):
         frame_motion.frame_jacobian(model, q, None, axes="local")
 
 

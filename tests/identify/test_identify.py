@@ -229,9 +229,7 @@ def test_bad_arguments_raise(arm, iiwa_log):
         identify.fit_torques(rod, log)
     with pytest.raises(ValueError, match=r"viscous of coordinate 1 is -0.5 in the model"):
         identify.fit_torques(arm.replace(damping=jnp.array([0.0, -0.5])), log)
-    with pytest.raises(
-        ValueError, match="the log has 1 sample; a motion is replayed from one sample to the next, so log two"
-    ):
+    with pytest.raises(ValueError, match="the log has 1 sample"):
         fit_motion(arm, log[:1])
     with pytest.raises(ValueError, match="horizon=20 steps; a log of 20 samples allows 1 to 19"):
         fit_motion(arm, log, horizon=20)

@@ -769,7 +769,7 @@ def test_payload_is_what_loaded_logs_differ_by(truth):
     assert np.all(np.abs(fit.inertia - held)[seen] <= fit.factor * fit.std[seen] + 1e-3)
     assert np.abs(fit.inertia - held)[seen].max() < 0.03
     assert inertia.is_feasible(fit.inertia)
-    with pytest.raises(ValueError, match=r"body is 'hand'; the bodies are a, b"):
+    with pytest.raises(ValueError, match="body is 'hand'"):
         identify.fit_payload(nominal, unloaded, loaded, "hand")
 
 

@@ -63,7 +63,7 @@ def test_log_must_fit_the_model(signals, arm):
     check_log(log, arm)
     with pytest.raises(ValueError, match=r"1 columns of q, model 'arm' has 2 \(joints shoulder, elbow\)"):
         check_log(identify.Log(signals["t"], *(signals[k][:, :1] for k in ("q", "v", "a", "tau"))), arm)
-    with pytest.raises(ValueError, match=r"the log has no a; .*from_raw"):
+    with pytest.raises(ValueError, match="the log has no a"):
         check_log(identify.Log(**signals | dict(a=None)), arm)
     with pytest.raises(ValueError, match=r"joints are elbow, shoulder.*joint_names=model.joint_names"):
         check_log(identify.Log(**signals, joint_names=("elbow", "shoulder")), arm)
@@ -98,7 +98,7 @@ def test_columns_with_joint_names_follow_the_model(signals, tmp_path):
     log = jd.read_log(path, joint_names=("shoulder", "elbow"))
     np.testing.assert_array_equal(log.q, signals["q"][:, ::-1])
     np.testing.assert_array_equal(jd.read_log(path, joint_names=("elbow",)).tau, signals["tau"][:, :1])
-    with pytest.raises(ValueError, match="missing columns q_wrist, v_wrist, a_wrist, tau_wrist; the file has t"):
+    with pytest.raises(ValueError, match="missing columns q_wrist, v_wrist, a_wrist, tau_wrist"):
         jd.read_log(path, joint_names=("elbow", "wrist"))
 
 

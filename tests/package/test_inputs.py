@@ -404,7 +404,7 @@ def test_motions_start_from_unit_quaternions(modes):
     scene = jd.Scene(model, forces=(jd.contact.DryFriction(0.3, normal=1.0, along=0),) if modes else ())
     starts = jnp.asarray([[1.0, 0, 0, 0], [2.0, 0, 0, 0], [1.0002, 0, 0, 0], [0.0, 0, 0, 0], [jnp.nan, 0, 0, 0]])
     v0, options = jnp.asarray([1.0, 0.2, 0.1]), {"throw": False} | ({} if modes else {"stepsize": 0.05})
-    with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1; divide it by its length"):
+    with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1"):
         jd.simulate(scene, starts[1], v0, [0.0, 0.1], **options)
     run = jax.jit(jax.vmap(lambda q: jd.simulate(scene, q, v0, [0.0, 0.1], **options)))
     computed = run(starts)
@@ -425,7 +425,7 @@ def test_codes_of_a_batch_print_as_words():
     stalled = jax.jit(lambda x: jd.RESULTS.where(x > 0, jd.RESULTS.successful, jd.RESULTS.stalled))(0.0)
     assert f"{stalled}" == "stalled" and "not solved to the tolerance" in jd.RESULTS[stalled]
     assert repr(pickle.loads(pickle.dumps(stalled))) == "stalled"
-    with pytest.raises(ValueError, match=r"compared with 0; compare it with jd.RESULTS.successful"):
+    with pytest.raises(ValueError, match="compared with 0"):
         assert one.result == 0
 
 

@@ -189,7 +189,7 @@ def test_refusals_and_codes():
     solve = jd.constrained_inverse_dynamics
     with pytest.raises(ValueError, match=r"joint 'crank' is not in model"):
         solve(scene, q, v, [0.0], motors=["crank"])
-    with pytest.raises(ValueError, match=r"motors is \[0, 0\]; give names of joints or different indices"):
+    with pytest.raises(ValueError, match=r"motors is \[0, 0\]"):
         solve(scene, q, v, [0.0, 0.0], motors=[0, 0])
     with pytest.raises(ValueError, match=r"a_independent has shape \(2,\), expected \(1,\)"):
         solve(scene, q, v, [0.0, 1.0], motors=[0])
@@ -197,9 +197,9 @@ def test_refusals_and_codes():
         ValueError, match=r"v has shape \(2,\), expected \(3,\) or \(1,\), all velocities or the independent ones"
     ):
         solve(scene, q, v[:2], [0.0], motors=[0])
-    with pytest.raises(ValueError, match=r"weights is \[-1.\]; give positive numbers"):
+    with pytest.raises(ValueError, match=r"weights is \[-1.\]"):
         solve(scene, q, v, [0.0], motors=[0], weights=[-1.0])
-    with pytest.raises(ValueError, match="names no velocities; give independent"):
+    with pytest.raises(ValueError, match="names no velocities"):
         solve(scene, q, v, [0.0], motors=np.eye(3)[:, :1])
     with pytest.raises(ValueError, match="motors: they cannot produce this motion"):
         solve(jd.Scene(model), q, v, jnp.ones(3), motors=[0], independent=[0, 1, 2])
@@ -232,9 +232,7 @@ def test_small_motions_are_judged_by_their_size():
 def test_all_velocities_have_one_order():
     model = jd.robots.chain(2)
     q, v, a = jnp.array([0.4, -0.7]), jnp.array([0.3, 0.5]), jnp.array([1.0, 2.0])
-    with pytest.raises(
-        ValueError, match=r"motors has all velocities, in the order \[1, 0\]; name them in the order of the model"
-    ):
+    with pytest.raises(ValueError, match=r"motors has all velocities, in the order \[1, 0\]"):
         jd.constrained_inverse_dynamics(model, q, v, a, motors=model.joint_names[::-1])
 
 

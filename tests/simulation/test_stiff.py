@@ -349,9 +349,7 @@ def test_default_solver_and_advice_follow_stiffness():
         computed = run(stiffness)
         assert computed.solver == solver
         np.testing.assert_allclose(computed.q, case.exact(stiffness), rtol=0, atol=1e-10)
-    with pytest.raises(
-        RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.38e-05 s; pass solver=jd.solvers.Ro"
-    ):
+    with pytest.raises(RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.38e-05 s"):
         run(1e9, solver=diffrax.Dopri8())
 
 

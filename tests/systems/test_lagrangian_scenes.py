@@ -533,7 +533,7 @@ def test_inertia_of_a_box_and_its_change_of_frame():
 
 
 def test_unknown_formulations_are_refused():
-    with pytest.raises(ValueError, match="formulation is 'newton'; choose from lagrangian, model, immersion, loop"):
+    with pytest.raises(ValueError, match="formulation is 'newton'"):
         scenes.double_pendulum(formulation="newton")
     with pytest.raises(ValueError, match=r"formulation='loop' takes moments\[1\] > 0"):
         scenes.double_pendulum(formulation="loop", moments=(0.0, 0.0))

@@ -199,7 +199,7 @@ def test_dissipation():
     assert_close(rows(system, q, v, t), [-0.6, -0.66], 1e-15)
     with pytest.raises(ValueError, match=r"function returned shape \(2,\)"):
         jd.forces.RayleighDissipation(lambda q, v, t: v)(system, q, v, t)
-    with pytest.raises(ValueError, match="direction is 0; give the sign of the sliding velocity"):
+    with pytest.raises(ValueError, match="direction is 0"):
         jd.forces.SlidingFriction(0.3, 2.0, 0)
     with pytest.raises(ValueError, match=r"coefficient is -0\.3"):
         jd.forces.SlidingFriction(-0.3, 2.0, 1)
@@ -252,7 +252,7 @@ def test_bad_systems_are_refused():
     q = jnp.zeros(2)
     with pytest.raises(ValueError, match=r"mass_matrix returned shape \(3, 3\), expected \(2, 2\)"):
         dynamics.mass_matrix(system, q)
-    with pytest.raises(ValueError, match="no potential energy; pass potential="):
+    with pytest.raises(ValueError, match="no potential energy"):
         jd.potential_energy(system, q)
     with pytest.raises(ValueError, match=r"q has shape \(3,\), expected \(2,\)"):
         dynamics.mass_matrix(system, jnp.zeros(3))
