@@ -618,7 +618,7 @@ def test_info_counts_couplings(panda, run):
     assert "Degrees of freedom after constraints: 8 of 9" in text and "gear" in text
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_simulate_a_file_with_a_loop(four_bar, folder, run):
     """From its keyframe, closed at the start, and closed to its end; a start that the file does not name is refused."""
     command = f"simulate {four_bar} --duration 0.2 --sample 0.05 --out motion.npz"

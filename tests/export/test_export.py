@@ -295,7 +295,9 @@ def test_redundant_rows(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("constrained", [False, True], ids=["free", "constrained"])
+@pytest.mark.parametrize(
+    "constrained", [pytest.param(False, marks=pytest.mark.slow), True], ids=["free", "constrained"]
+)
 def test_a_step_of_an_integrator(constrained, tmp_path):
     scene = jd.scenes.four_bar() if constrained else jd.Scene(jd.robots.ur5())
     q, v = map(np.asarray, jd.scenes.four_bar.start()) if constrained else (X[:6], V[:6])

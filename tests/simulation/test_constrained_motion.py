@@ -320,7 +320,7 @@ def test_rows_at_small_angles_hold(method):
     angles = np.asarray([1e-2, 1e-3, 1e-4, 3e-5, 1e-5, 4e-6])
     # The condition number is 2 / angle.
     bounds = 8 * np.finfo(float).eps / angles
-    for compiled in ("auto", "plain"):
+    for compiled in ("auto", "plain") if method == "multipliers" else ("auto",):
         with jd.compilation(compiled):
             errors = np.abs(np.asarray(end_of(angles)) - [0.5, 0.0, 0.0]).max(1)
         np.testing.assert_array_less(errors, bounds)
