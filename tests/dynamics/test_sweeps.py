@@ -69,12 +69,17 @@ def test_as_the_recursions_that_are_written_out(kinds, given):
         assert_close(a, b, 1e-12)
 
 
-@pytest.mark.parametrize("kinds", KINDS)
-@pytest.mark.parametrize("given", [False, True])
-@pytest.mark.parametrize("armature", [False, True])
+@pytest.mark.parametrize(
+    ("armature", "given", "kinds"),
+    [
+        pytest.param(armature, given, kinds, marks=() if armature or kinds == KINDS[0] else pytest.mark.slow)
+        for armature in (False, True)
+        for given in (False, True)
+        for kinds in KINDS
+        if not given or len(kinds) == 1
+    ],
+)
 def test_floating_base(kinds, given, armature):
-    if given and len(kinds) > 1:
-        return
     model = floating(kinds, armature=armature)
     assert sweeps.has_sweeps(model)
     q, v, x = state(model)
@@ -178,7 +183,7 @@ def test_hundreds_of_links(links, branching):
 MIXED = ("revolute", "spherical", "prismatic", "planar", "free", "helical")
 
 
-@pytest.mark.parametrize("kinds", [("spherical",), MIXED])
+@pytest.mark.parametrize("kinds", [pytest.param(("spherical",), marks=pytest.mark.slow), MIXED])
 @pytest.mark.parametrize("given", [False, True])
 def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
     """Dynamics in link frames and kinematics as native loops, against products of matrices by JAX."""
