@@ -329,7 +329,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(truth, folder, run):
         jd.save_urdf(truth, "x.urdf", torques={"elbow": {"offset": 1.0}})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_identify_finds_delays(truth, folder, run):
     """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""
     simulate_logs(truth, "AB", noise=0.005, delay=0.02)
@@ -387,7 +387,7 @@ def test_identify_a_payload(truth, run):
     assert "the bodies are" in run(f"{command} --payload-body foot", status=2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_identify_the_gains_of_drives_from_a_known_payload(truth, folder, run):
     """Currents of three drives; what is written is then the robot in newton metres."""
     gains = np.array([0.8, 1.2, 1.1])
@@ -618,7 +618,7 @@ def test_info_counts_couplings(panda, run):
     assert "Degrees of freedom after constraints: 8 of 9" in text and "gear" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_simulate_a_file_with_a_loop(four_bar, folder, run):
     """From its keyframe, closed at the start, and closed to its end; a start that the file does not name is refused."""
     command = f"simulate {four_bar} --duration 0.2 --sample 0.05 --out motion.npz"

@@ -37,11 +37,6 @@ STILL = (np.zeros(3), np.zeros(3))
 SPIN = (np.zeros(3), np.array([0.0, 0.0, 0.7]))
 
 
-def normal_and_side(rates, t):
-    """Force of the table on the block."""
-    return MASS * GRAVITY - rates[1] * t, -rates[0] * t
-
-
 def motion(mu, rates):
     return jd.simulate(block(mu), *STILL, TIMES, control=push(rates), stepsize=0.11, outputs=WORDS, throw=False)
 

@@ -316,7 +316,7 @@ def test_motors_must_be_as_many_as_degrees_of_freedom(tmp_path):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_identifies_a_mechanism_from_a_log_of_its_motor(tmp_path, capsys):
     true, _ = loaded(tmp_path, "four-bar", (0.9, 1.5)), loaded(tmp_path, "four-bar", (1.1, 1.2))
     t = np.linspace(0, 10, 1001)

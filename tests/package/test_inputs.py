@@ -197,7 +197,6 @@ def stiffer(q, v, t):
     return -q if t < 0.5 else q
 
 
-GIVEN_STEPS = diffrax.StepTo(jnp.linspace(0, 1, 5))
 OPTIONS = [
     ({"stepsize": jd.simulation.Steps(rtol=np.inf)}, "rtol is inf; pass a finite number"),
     ({"stepsize": jd.simulation.Steps(rtol=-1)}, "rtol is -1; pass a finite number that is not negative"),

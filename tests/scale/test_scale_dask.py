@@ -602,7 +602,7 @@ def test_cross_validation_of_a_fit(client):
         np.testing.assert_array_equal(one.squares, other.squares)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_identification_from_the_shell(cluster, tmp_path, capsys):
     """The report of a fit whose cross-validation runs on workers is that of this process."""
     from jaxdyn.cli import main
