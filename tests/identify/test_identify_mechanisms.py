@@ -49,7 +49,7 @@ def computed(scene, log, parameters, observed):
     return jd.identify.fit_parameters(scene, log, parameters, objective, jd.identify.Solver(tolerance=1e-8, steps=15))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_energy_tells_the_coupler_of_a_four_bar():
     """Its mass by the balance of energy, which constraints do not enter, from the crank alone."""
     q0, v0 = jd.scenes.four_bar.start()
