@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
+import jaxdyn as jd
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.systems.system import velocity_to_rate
 
 
@@ -24,7 +24,7 @@ def motion_jacobian(scene, state, coordinates):
 
     def rate(x, *args):
         q, v = state(x, *args)
-        a = constrained_dynamics(scene, q, v, method="schur").acceleration
+        a = jd.constrained_dynamics(scene, q, v, method="schur").acceleration
         return jax.jvp(coordinates, (q, v), (velocity_to_rate(scene.system, q, v), a))[1]
 
     return jax.jacfwd(rate)

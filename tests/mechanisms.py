@@ -3,15 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.constraints import loop
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.configuration import neutral
-from jaxdyn.systems.scene import Scene
+import jaxdyn as jd
 
 
 def slider(mass=1.0):
     """A body on a rail, without gravity."""
-    builder = ModelBuilder("slider", gravity=None)
+    builder = jd.ModelBuilder("slider", gravity=None)
     builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
     return builder.build()
 
@@ -25,7 +22,7 @@ def stewart():
 
     The length of leg i is the distance from `ANCHORS[i]` on the ground to `CORNERS[i]` on the plate.
     """
-    builder, loops = ModelBuilder("stewart platform"), []
+    builder, loops = jd.ModelBuilder("stewart platform"), []
     builder.add_body("plate", None, "free", (20.0, (0.0, 0.0, 0.0), (2.0, 2.0, 4.0)))
     for i in range(6):
         yoke, sleeve, rod = f"yoke{i}", f"sleeve{i}", f"rod{i}"
@@ -33,14 +30,14 @@ def stewart():
         builder.add_body(sleeve, yoke, "revolute", (3.0, (0, 0, 0.3), (0.1, 0.1, 0.01)), axis=(0, 1, 0))
         inertia = (1.0, (0.0, 0.0, -0.3), (0.05, 0.05, 0.005))
         builder.add_body(rod, sleeve, "prismatic", inertia, axis=(0, 0, 1), joint_name=f"leg{i}")
-        loops.append(loop(rod, None, "plate", tuple(CORNERS[i]), "spherical", name=f"ball{i}"))
+        loops.append(jd.loop(rod, None, "plate", tuple(CORNERS[i]), "spherical", name=f"ball{i}"))
     model = builder.build()
-    q = np.array(neutral(model))
+    q = np.array(jd.neutral(model))
     place = dict(zip(model.body_names, model.topology.q_slices, strict=True))
     q[place["plate"]][2] = 1.2
     for i in range(6):
         q[place[f"rod{i}"]] = 1.3
-    return Scene(model, tuple(loops)), jnp.asarray(q)
+    return jd.Scene(model, tuple(loops)), jnp.asarray(q)
 
 
 ANCHORS = np.array([_on_circle(1.0, 120 * (i // 2) + 10 * (2 * (i % 2) - 1)) for i in range(6)])
@@ -56,7 +53,7 @@ def delta():
     The rods of each parallelogram are one rod in balls at both ends, as their sum is; the platform has three prismatic joints,
     as the parallelograms hold its axes. Hip angles are positive downwards.
     """
-    builder, loops = ModelBuilder("delta"), []
+    builder, loops = jd.ModelBuilder("delta"), []
     point = (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     builder.add_body("x_slide", None, "prismatic", point, axis=(1, 0, 0), joint_name="x")
     builder.add_body("y_slide", "x_slide", "prismatic", point, axis=(0, 1, 0), joint_name="y")
@@ -71,14 +68,14 @@ def delta():
         builder.add_body(f"yoke{i}", f"arm{i}", "continuous", yoke, axis=(0, 1, 0), pose=(UPPER, 0.0, 0.0))
         builder.add_body(f"rod{i}", f"yoke{i}", "continuous", rod, axis=(1, 0, 0))
         ankle = tuple(_on_circle(PLATE, 120 * i))
-        loops.append(loop(f"rod{i}", (0.0, 0.0, -LOWER), "platform", ankle, "spherical", name=f"ankle{i}"))
+        loops.append(jd.loop(f"rod{i}", (0.0, 0.0, -LOWER), "platform", ankle, "spherical", name=f"ankle{i}"))
     model = builder.build()
     q = np.zeros(model.nq)
     place = dict(zip(model.joint_names, model.topology.q_slices, strict=True))
     q[place["z"]] = -0.7
     for i in range(3):
         q[place[f"hip{i}"]] = 0.3
-    return Scene(model, tuple(loops)), jnp.asarray(q)
+    return jd.Scene(model, tuple(loops)), jnp.asarray(q)
 
 
 def delta_hips(point):

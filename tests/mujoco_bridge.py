@@ -10,7 +10,6 @@ import numpy as np
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from jaxdyn.model.tree import Model
 
 # What makes M or the bias another than MuJoCo's, as the warning at load says.
 APART = ("armature of tendons", "gyroscopic part of the armature")
@@ -23,7 +22,7 @@ class Oracle:
     `whole` is the same file as it is.
     """
 
-    def __init__(self, path, model: Model):
+    def __init__(self, path, model: jd.Model):
         self.model, self.path = model, str(path)
         self.whole = mujoco.MjModel.from_xml_path(self.path)
         m = self.m = mujoco.MjModel.from_xml_path(self.path)

@@ -14,9 +14,8 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 from xla_options import QUICK
 
-from jaxdyn.io import load_model
+import jaxdyn as jd
 from jaxdyn.model.topology import KINDS, SCREW_KINDS
-from jaxdyn.model.tree import Model, Topology
 
 ROBOTS = os.path.join(os.path.dirname(pin.__file__), "../../../../share/example-robot-data/robots")
 
@@ -61,7 +60,7 @@ def quick(function):
     return jax.jit(function, compiler_options=QUICK)
 
 
-def to_pinocchio(model: Model) -> tuple[pin.Model, Bridge]:
+def to_pinocchio(model: jd.Model) -> tuple[pin.Model, Bridge]:
     """The same mechanism in Pinocchio. Body frames and named frames are operational frames of the same names.
 
     Joint axes may pass beside our body frame's origin, Pinocchio's may not, so the joint frame is moved onto the axis.
@@ -101,7 +100,7 @@ def to_pinocchio(model: Model) -> tuple[pin.Model, Bridge]:
     return out, Bridge(topology.kinds, circles, offsets)
 
 
-def to_jaxdyn(source: pin.Model, dtype=jnp.float64) -> tuple[Model, Bridge]:
+def to_jaxdyn(source: pin.Model, dtype=jnp.float64) -> tuple[jd.Model, Bridge]:
     """The same mechanism in jaxdyn, with Pinocchio's joint frames as body frames and all of its frames by name.
 
     Raises ValueError for joints that have no kind on our side.
@@ -118,7 +117,7 @@ def to_jaxdyn(source: pin.Model, dtype=jnp.float64) -> tuple[Model, Bridge]:
     for frame in source.frames[1:]:
         frames.append((frame.name, frame.parentJoint - 1, frame.placement.homogeneous))
     unique = {name: (body, pose) for name, body, pose in frames}
-    topology = Topology(
+    topology = jd.model.Topology(
         name=source.name,
         parents=tuple(int(source.parents[i + 1]) - 1 for i in range(nb)),
         kinds=tuple(kinds),
@@ -139,7 +138,7 @@ def to_jaxdyn(source: pin.Model, dtype=jnp.float64) -> tuple[Model, Bridge]:
     return _model(topology, leaves, dtype), Bridge(tuple(kinds), tuple(circles), np.tile(np.eye(4), (nb, 1, 1)))
 
 
-def load_robot(path: str, *, floating=False, lock=()) -> tuple[pin.Model, Model, Bridge]:
+def load_robot(path: str, *, floating=False, lock=()) -> tuple[pin.Model, jd.Model, Bridge]:
     """A robot of example-robot-data by its path below the folder of robots; `lock` names joints to fix at neutral."""
     file = os.path.join(ROBOTS, path)
     source = pin.buildModelFromUrdf(file, pin.JointModelFreeFlyer()) if floating else pin.buildModelFromUrdf(file)
@@ -149,7 +148,7 @@ def load_robot(path: str, *, floating=False, lock=()) -> tuple[pin.Model, Model,
     return (source, *to_jaxdyn(source))
 
 
-def random_tree(seed: int, kinds, *, parents=None, armature=True, dtype=jnp.float64) -> Model:
+def random_tree(seed: int, kinds, *, parents=None, armature=True, dtype=jnp.float64) -> jd.Model:
     """A random tree with the given joint kinds: skew placements and axes, tapering physical inertias.
 
     Parents are drawn so that every subtree is listed without gaps, or given. Each body carries one extra frame.
@@ -176,7 +175,7 @@ def random_tree(seed: int, kinds, *, parents=None, armature=True, dtype=jnp.floa
             screws[i, 3:] = axis
     inertias = np.stack([random_inertia(rng) * 0.8 ** (i % 8) for i in range(n)])
     names = tuple(f"b{i}" for i in range(n))
-    topology = Topology(
+    topology = jd.model.Topology(
         name=f"tree{seed}",
         parents=tuple(parents),
         kinds=tuple(kinds),
@@ -196,11 +195,11 @@ def random_tree(seed: int, kinds, *, parents=None, armature=True, dtype=jnp.floa
     return _model(topology, leaves, dtype)
 
 
-def make_model(parents, home, screws, inertias, *, kinds=None, gravity=(0.0, 0.0, -9.81), armature=None) -> Model:
+def make_model(parents, home, screws, inertias, *, kinds=None, gravity=(0.0, 0.0, -9.81), armature=None) -> jd.Model:
     """A model from its numbers; joints are revolute unless `kinds` says otherwise. Frames are the bodies' alone."""
     n = len(parents)
     names = tuple(f"b{i}" for i in range(n))
-    topology = Topology(
+    topology = jd.model.Topology(
         name="made",
         parents=tuple(parents),
         kinds=tuple(kinds or ("revolute",) * n),
@@ -220,7 +219,7 @@ def make_model(parents, home, screws, inertias, *, kinds=None, gravity=(0.0, 0.0
     return _model(topology, leaves, jnp.float64)
 
 
-def random_states(model: Model, n: int, seed: int):
+def random_states(model: jd.Model, n: int, seed: int):
     """Batches of q (n, nq), v, a, tau (n, nv) and external wrenches (n, nb, 6)."""
     rng = np.random.default_rng(seed)
     dtype = model.home.dtype
@@ -252,18 +251,18 @@ def assert_close(got, want, tol=1e-10, label=""):
     assert error <= tol * size, f"{label}: error {error:.3e}, size {size:.3e}"
 
 
-def as_dtype(model: Model, dtype) -> Model:
+def as_dtype(model: jd.Model, dtype) -> jd.Model:
     """The same model with every leaf in another dtype."""
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x).astype(dtype)), model)
 
 
-def _model(topology: Topology, leaves: dict, dtype) -> Model:
+def _model(topology: jd.model.Topology, leaves: dict, dtype) -> jd.Model:
     leaves = {name: None if x is None else jnp.asarray(x, dtype) for name, x in leaves.items()}
     # By numpy, as all of this: XLA would compile a program for every size.
     limits = {name: jnp.asarray(np.full(topology.nv, np.inf), dtype) for name in ("velocity_limit", "effort_limit")}
     for name, bound in (("lower", -np.inf), ("upper", np.inf)):
         limits[name] = jnp.asarray(np.full(topology.nq, bound), dtype)
-    return Model(**leaves, **limits, damping=None, friction=None, topology=topology)
+    return jd.Model(**leaves, **limits, damping=None, friction=None, topology=topology)
 
 
 def _kind(joint) -> tuple[str, bool, np.ndarray]:
@@ -324,7 +323,7 @@ ROBOT_FILES = _paths()
 def load_both(file, floating):
     """The robot on both sides, and the conversion of configurations."""
     source = pin.buildModelFromUrdf(ROBOT_FILES[file], *([pin.JointModelFreeFlyer()] if floating else []))
-    model = load_model(ROBOT_FILES[file], floating_base=floating)
+    model = jd.load_model(ROBOT_FILES[file], floating_base=floating)
     extra = [
         joint.nq - (part.stop - part.start)
         for joint, part in zip(list(source.joints)[1:], model.topology.q_slices, strict=True)

@@ -15,8 +15,6 @@ import jaxdyn as jd
 from benchmarks.linkages import bennett
 from jaxdyn.cli import main
 from jaxdyn.identify.torque_terms import coulomb_through_filter
-from jaxdyn.io import read_torque_terms
-from jaxdyn.io.logs import read_log, write_log
 
 GIVEN = "--v-s 0.01 --prior 1 --robust none"
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
@@ -129,7 +127,7 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, folder, run):
     model = jd.load_model(arm)
     names = [f"{signal}_{joint}" for signal in ("q", "v", "tau") for joint in model.joint_names]
     assert [name.partition(" [")[0] for name in columns] == ["t", *names, "energy", "work"]
-    log = read_log("motion.csv", joint_names=model.joint_names)
+    log = jd.read_log("motion.csv", joint_names=model.joint_names)
     q0, v0 = np.array([0.5, 0.0, 0.0]), np.array([0.1, 0.0, -0.2])
     motion = jd.simulate(
         jd.Scene(model, forces=[jd.forces.JointDamping()]),
@@ -147,7 +145,7 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, folder, run):
     # The file is a log: replayed, it gives the motion again, up to the torque between two rows.
     run(f"simulate {arm} --sample 0.05 --friction 0 --torque motion.csv --out again.npz")
     # Between rows of 0.05 s the torque is a line where it was a curve: 1e-5 rad here.
-    np.testing.assert_allclose(read_log("again.npz").q, motion.q, atol=2e-5)
+    np.testing.assert_allclose(jd.read_log("again.npz").q, motion.q, atol=2e-5)
 
 
 @pytest.mark.long
@@ -175,7 +173,7 @@ def test_a_simulation_that_stops_early_is_exit_status_1(arm, run):
 def test_identify_the_recorded_panda_from_raw_samples(panda, franka, run):
     """Held-out torque error at most 1.45 %; unconstrained least squares with the same filter and split has 1.36 %."""
     t, q, tau = franka
-    write_log("log.csv", jd.identify.Log(t, q, tau=tau))
+    jd.io.write_log("log.csv", jd.identify.Log(t, q, tau=tau))
     command = f"identify --urdf {panda} --lock {' '.join(FINGERS)} --cutoff 8"
     terms = f"--terms {' '.join(jd.identify.TERMS)} --v-s 0.01 --prior 1 --weights none"
     assert "low-passed at 8 Hz" in run(f"{command} {terms} --log log.csv --out fitted.urdf")
@@ -203,7 +201,7 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, run):
     assert report["torque_error"]["final_percent"] < report["torque_error"]["test_percent"]
 
     # The same samples, filtered beforehand and so marked by their accelerations, give the same answer.
-    write_log("filtered.npz", jd.identify.from_raw(t, q, tau))
+    jd.io.write_log("filtered.npz", jd.identify.from_raw(t, q, tau))
     assert "used as filtered" in run(f"{command} --log filtered.npz --method least-squares --report ls.json")
     report = report_of("ls.json")
     assert abs(report["torque_error"]["test_percent"] - 1.36) < 0.01
@@ -215,7 +213,7 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, run):
 def test_identify_the_recorded_panda_with_terms_chosen(panda, franka, run):
     """By default terms, prior and smoothing are chosen on the training part alone: below 1.30 % on the rest."""
     t, q, tau = franka
-    write_log("log.csv", jd.identify.Log(t, q, tau=tau))
+    jd.io.write_log("log.csv", jd.identify.Log(t, q, tau=tau))
     command = f"identify --urdf {panda} --log log.csv --lock {' '.join(FINGERS)} --cutoff 8 --out fitted.urdf"
     assert "dahl at panda_joint1" in run(command)
     report = report_of("fitted.json")
@@ -244,7 +242,7 @@ def simulate_logs(model, names, noise=0.0, delay=0.0, gains=1.0):
 
         q, v, a = at(t)
         tau = jd.identify.regressor(model, *at(t - delay)) @ jd.identify.nominal_parameters(model)
-        write_log(f"{name}.csv", jd.identify.Log(t, q, v, a, tau / gains + noise * rng.normal(size=tau.shape)))
+        jd.io.write_log(f"{name}.csv", jd.identify.Log(t, q, v, a, tau / gains + noise * rng.normal(size=tau.shape)))
 
 
 @pytest.mark.long
@@ -259,7 +257,7 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, truth, run):
         q, v, a = (np.sum(size * x, 1) for x in (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle)))
         tau = jd.identify.regressor(truth, q, v, a) @ jd.identify.nominal_parameters(truth)
         tau += 0.05 * np.abs(tau).max(axis=0) * np.sin(2 * np.pi * 9 * t)[:, None]
-        write_log(f"{seed}.csv", jd.identify.Log(t, q, tau=tau))
+        jd.io.write_log(f"{seed}.csv", jd.identify.Log(t, q, tau=tau))
     command = f"identify --urdf {arm} --log 0.csv --test-log 1.csv --report fit.json --repair --terms viscous {GIVEN}"
     text = run(command)
     assert re.search(r"--cutoff auto: 5(\.\d+)? Hz, ten times the band of the motion, 0.5", text)
@@ -317,7 +315,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(truth, folder, run):
     (folder / "fit.txt").write_text(options)
     assert "v_s 0.02, prior 1, loss squares" in run("identify @fit.txt --prior 1")
     computed = report_of("fitted.json")
-    torques = read_torque_terms("fitted.urdf")
+    torques = jd.io.read_torque_terms("fitted.urdf")
     assert [torques[name]["offset"] for name in truth.joint_names] == computed["friction"]["offset"]
     assert {torques[name]["v_s"] for name in truth.joint_names} == {0.02}
     assert [torques[name]["quadratic"] for name in truth.joint_names] == computed["extra_terms"]["quadratic"]
@@ -331,7 +329,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(truth, folder, run):
         jd.save_urdf(truth, "x.urdf", torques={"elbow": {"offset": 1.0}})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_identify_finds_delays(truth, folder, run):
     """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""
     simulate_logs(truth, "AB", noise=0.005, delay=0.02)
@@ -389,7 +387,7 @@ def test_identify_a_payload(truth, run):
     assert "the bodies are" in run(f"{command} --payload-body foot", status=2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_identify_the_gains_of_drives_from_a_known_payload(truth, folder, run):
     """Currents of three drives; what is written is then the robot in newton metres."""
     gains = np.array([0.8, 1.2, 1.1])

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdyn.compile import compilation, kernel, target
+import jaxdyn as jd
+from jaxdyn.compile import kernel, target
 from jaxdyn.compile.batch import repeat_while
 from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.expansion import expand
@@ -87,7 +88,7 @@ def test_branches_of_a_loop_are_taken_by_the_samples_that_need_them(count):
         return x, jnp.zeros(()), jnp.zeros((), jnp.int64), jnp.zeros((), jnp.int32)
 
     def by_jax(x):
-        with compilation("plain"):
+        with jd.compilation("plain"):
             return native(x)
 
     scale, limit = jnp.asarray(0.75), jnp.asarray(1.2)

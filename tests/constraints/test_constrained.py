@@ -10,22 +10,9 @@ from pinocchio_bridge import assert_close, quick, random_tree, to_pinocchio
 import jaxdyn as jd
 from benchmarks.report_cases import test_set
 from jaxdyn import scenes
-from jaxdyn.constraints import Holonomic, Pfaffian, lock_joint, loop, rolling_wheel
-from jaxdyn.constraints.assembly import assemble, residuals
+from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.base import rows
-from jaxdyn.constraints.dynamics import (
-    RESULTS,
-    constrained_dynamics,
-    projections,
-    second_fundamental_form,
-)
-from jaxdyn.constraints.frames import constraint_forces, constraint_wrenches
 from jaxdyn.constraints.rank import pseudo_inverse
-from jaxdyn.dynamics.kinematics import forward_kinematics
-from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, gravity_force, mass_matrix
-from jaxdyn.model.configuration import difference, integrate
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
 
 KINDS = ("free", "revolute", "spherical", "prismatic", "helical")
 
@@ -42,12 +29,15 @@ def tree():
     q[place.start] += 1.0
     q[place] /= np.linalg.norm(q[place])
     # The loops are closed where the guess is: the frames are put there.
-    poses = np.asarray(forward_kinematics(model, jnp.asarray(q)))
-    pose = np.asarray(loop("a", POSE, "b", None).pose_a)
+    poses = np.asarray(jd.forward_kinematics(model, jnp.asarray(q)))
+    pose = np.asarray(jd.loop("a", POSE, "b", None).pose_a)
     ball = jnp.asarray(np.linalg.inv(poses[4]) @ poses[2] @ pose)
     weld = jnp.asarray(np.linalg.inv(poses[0]) @ pose)
-    closing = loop("b2", POSE, "b4", ball, "spherical", name="ball"), loop(None, POSE, "b0", weld, "weld", name="weld")
-    scene = Scene(model, closing)
+    closing = (
+        jd.loop("b2", POSE, "b4", ball, "spherical", name="ball"),
+        jd.loop(None, POSE, "b0", weld, "weld", name="weld"),
+    )
+    scene = jd.Scene(model, closing)
     return scene, jnp.asarray(q), jnp.asarray(rng.normal(size=model.nv)), jnp.asarray(rng.normal(size=model.nv))
 
 
@@ -61,30 +51,30 @@ def solved(tree):
 
     @quick
     def compute(scene, q, guess, tau):
-        assembly = assemble(scene, q, guess)
+        assembly = jd.assemble(scene, q, guess)
         q, v = assembly.q, assembly.v
         row = rows(scene, q, v, 0.0)
-        ranked, schur = (constrained_dynamics(scene, q, v, tau, method=method) for method in ("rank_aware", "schur"))
+        ranked, schur = (jd.constrained_dynamics(scene, q, v, tau, method=method) for method in ("rank_aware", "schur"))
         return {
             "q": q,
             "v": v,
             "residual": assembly.residual,
             "A": row.A,
             "gamma": row.gamma,
-            "M": mass_matrix(scene.system, q),
-            "h": bias_force(scene.system, q, v),
-            "C": coriolis_matrix(scene.system, q, v),
-            "N": gravity_force(scene.system, q),
+            "M": jd.mass_matrix(scene.system, q),
+            "h": jd.bias_force(scene.system, q, v),
+            "C": jd.coriolis_matrix(scene.system, q, v),
+            "N": jd.gravity_force(scene.system, q),
             "a": ranked.acceleration,
             "lam": ranked.multipliers,
             "rank": ranked.rank,
-            "result": ranked.result == RESULTS.successful,
+            "result": ranked.result == jd.RESULTS.successful,
             "schur": schur.acceleration,
             "schur lam": schur.multipliers,
-            "P_T": projections(scene, q).P_T,
-            "S": second_fundamental_form(scene, q, v),
-            "wrenches": constraint_wrenches(scene, q, ranked.multipliers),
-            "forces": constraint_forces(scene, q, ranked.multipliers),
+            "P_T": jd.constraints.projections(scene, q).P_T,
+            "S": jd.constraints.second_fundamental_form(scene, q, v),
+            "wrenches": jd.constraints.constraint_wrenches(scene, q, ranked.multipliers),
+            "forces": jd.constraint_forces(scene, q, ranked.multipliers),
         }
 
     return jax.tree.map(np.asarray, compute(scene, q, guess, tau)) | {"tau": np.asarray(tau)}
@@ -153,10 +143,10 @@ def test_removed_method_and_dependent_rows(tree):
     """The error names what replaces a method that is gone; the Schur complement reports dependent rows."""
     scene, q, v, _ = tree
     with pytest.raises(ValueError, match="now"):
-        constrained_dynamics(scene, q, v, method="range_space")
-    broken = Scene(scene.system, scene.constraints[:1] * 2)
-    result = quick(lambda q, v: constrained_dynamics(broken, q, v, method="schur").result)(q, v)
-    assert bool(result == RESULTS.dependent_rows)
+        jd.constrained_dynamics(scene, q, v, method="range_space")
+    broken = jd.Scene(scene.system, scene.constraints[:1] * 2)
+    result = quick(lambda q, v: jd.constrained_dynamics(broken, q, v, method="schur").result)(q, v)
+    assert bool(result == jd.RESULTS.dependent_rows)
 
 
 def test_lemmas_of_the_projections(solved):
@@ -199,7 +189,7 @@ def relative_twists(scene, q, v):
     for constraint in scene.constraints:
 
         def relative(s, constraint=constraint):
-            poses = forward_kinematics(scene.system, integrate(scene.system, q, s * v))
+            poses = jd.forward_kinematics(scene.system, jd.integrate(scene.system, q, s * v))
             poses = jnp.concatenate([poses, jnp.eye(4)[None]])
             names = (*scene.system.body_names, None)
             a, b = (poses[names.index(n)] for n in (constraint.body_a, constraint.body_b))
@@ -219,27 +209,30 @@ def test_dependent_rows_give_the_same_motion_and_the_least_multipliers():
     q, v = scenes.four_bar.start()
     flat = scenes.four_bar()
     space = scenes.four_bar(in_plane=False)
-    twice = Scene(flat.system, flat.constraints * 2)
-    solve = quick(lambda scene: constrained_dynamics(scene, q, v))
+    twice = jd.Scene(flat.system, flat.constraints * 2)
+    solve = quick(lambda scene: jd.constrained_dynamics(scene, q, v))
     one, five, four = solve(flat), solve(space), solve(twice)
     assert [int(x.rank) for x in (one, five, four)] == [2, 2, 2]
-    assert all(bool(x.result == RESULTS.successful) for x in (one, five, four))
+    assert all(bool(x.result == jd.RESULTS.successful) for x in (one, five, four))
     assert_close(five.acceleration, one.acceleration, 1e-11)
     assert_close(four.acceleration, one.acceleration, 1e-11)
     assert_close(five.multipliers, [*one.multipliers, 0, 0, 0], 1e-11)
     assert_close(four.multipliers, np.tile(one.multipliers / 2, 2), 1e-11)
     assert set(four.by_name()) == {"knee", "knee (1)"}
-    broken = quick(lambda scene: constrained_dynamics(scene, q, v, method="schur").result)(twice)
-    assert bool(broken == RESULTS.dependent_rows)
+    broken = quick(lambda scene: jd.constrained_dynamics(scene, q, v, method="schur").result)(twice)
+    assert bool(broken == jd.RESULTS.dependent_rows)
 
 
 def test_rows_without_a_solution_are_reported():
     """Both accelerations a = 0 and a = 1 are asked for."""
     q, v = jnp.zeros(2), jnp.ones(2)
-    system = LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
-    rest, move = Pfaffian(lambda q, t: jnp.eye(2)[:1]), Pfaffian(lambda q, t: jnp.eye(2)[:1], lambda q, t: t[None])
-    dynamics = quick(lambda q, v: constrained_dynamics(Scene(system, (rest, move)), q, v))(q, v)
-    assert bool(dynamics.result == RESULTS.contradictory_rows) and int(dynamics.rank) == 1
+    system = jd.LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
+    rest, move = (
+        jd.Pfaffian(lambda q, t: jnp.eye(2)[:1]),
+        jd.Pfaffian(lambda q, t: jnp.eye(2)[:1], lambda q, t: t[None]),
+    )
+    dynamics = quick(lambda q, v: jd.constrained_dynamics(jd.Scene(system, (rest, move)), q, v))(q, v)
+    assert bool(dynamics.result == jd.RESULTS.contradictory_rows) and int(dynamics.rank) == 1
 
 
 def differences(function, direction, h=1e-3):
@@ -256,7 +249,7 @@ def test_derivatives_in_states_and_masses_where_rows_depend():
     def value(x):
         scale = jnp.ones((3, 1)) + x[6] * jnp.asarray([[0.0], [0.0], [1.0]])
         model = scene.system.replace(inertias=scene.system.inertias * scale)
-        dynamics = constrained_dynamics(Scene(model, scene.constraints), q + x[:3], v + x[3:6])
+        dynamics = jd.constrained_dynamics(jd.Scene(model, scene.constraints), q + x[:3], v + x[3:6])
         return jnp.sum(dynamics.acceleration * jnp.asarray([1.0, -0.3, 0.7])) + jnp.sum(dynamics.multipliers**2)
 
     direction = jnp.asarray(np.random.default_rng(0).normal(size=7))
@@ -270,10 +263,10 @@ def test_second_derivatives_where_rows_depend():
     """Hessians of the same motion with a row listed once (both methods) and twice (rank-aware) agree, also at rest."""
     q, v = scenes.spherical_pendulum.start(length=1.2, theta=0.8, theta_rate=0.3)
     once = scenes.spherical_pendulum(length=1.2)
-    twice = Scene(once.system, once.constraints * 2)
+    twice = jd.Scene(once.system, once.constraints * 2)
 
     def value(x, scene, method):
-        return jnp.sum(constrained_dynamics(scene, x[:3], x[3:], method=method).acceleration ** 2)
+        return jnp.sum(jd.constrained_dynamics(scene, x[:3], x[3:], method=method).acceleration ** 2)
 
     x, at_rest = jnp.concatenate([q, v]), jnp.concatenate([q, 0 * v])
     for at in (x, at_rest):
@@ -316,12 +309,12 @@ def test_printed_numbers():
     angle, rate, mass, length = 0.5, 1.7, 0.7, 1.2
     q, v = scenes.pendulum_in_plane.start(length=length, angle=angle, rate=rate)
     pendulum = scenes.pendulum_in_plane(mass=mass, length=length)
-    dynamics = quick(lambda q, v: constrained_dynamics(pendulum, q, v))(q, v)
+    dynamics = quick(lambda q, v: jd.constrained_dynamics(pendulum, q, v))(q, v)
     np.testing.assert_allclose(dynamics.multipliers, -7.04496621, rtol=1e-9)
     np.testing.assert_allclose(-length * dynamics.multipliers, 8.45395945, rtol=1e-9)
 
     q, v = test_set.andrews.start()
-    dynamics = quick(lambda scene: constrained_dynamics(scene, q, v))(test_set.andrews())
+    dynamics = quick(lambda scene: jd.constrained_dynamics(scene, q, v))(test_set.andrews())
     want = [14222.4439199541138705911625887, -10666.8329399655854029433719415, 0, 0, 0, 0, 0]
     np.testing.assert_allclose(dynamics.acceleration, want, rtol=1e-11, atol=1e-8)
     # Printed multipliers stand on the left.
@@ -329,7 +322,7 @@ def test_printed_numbers():
     np.testing.assert_allclose(dynamics.multipliers, want, rtol=1e-11, atol=1e-11)
 
     q, v = scenes.rolling_coin.start()
-    dynamics = quick(lambda scene: constrained_dynamics(scene, q, v))(scenes.rolling_coin())
+    dynamics = quick(lambda scene: jd.constrained_dynamics(scene, q, v))(scenes.rolling_coin())
     normal, forward, across = np.asarray(dynamics.multipliers)
     np.testing.assert_allclose([normal, abs(across)], [2.990088, 0.174144017028], rtol=1e-10)
     assert abs(forward) < 1e-12
@@ -345,7 +338,11 @@ def test_spherical_pendulum_by_projection():
 
     @quick
     def compute(q, v):
-        return projections(scene, q).P_T, second_fundamental_form(scene, q, v), constrained_dynamics(scene, q, v)
+        return (
+            jd.constraints.projections(scene, q).P_T,
+            jd.constraints.second_fundamental_form(scene, q, v),
+            jd.constrained_dynamics(scene, q, v),
+        )
 
     P_T, bend, dynamics = compute(q, v)
     q, v = np.asarray(q), np.asarray(v)
@@ -378,7 +375,9 @@ def test_rolling_disk_with_torques():
     """I1 thetadd = tau_theta, (I2 + m rho^2) phidd = tau_phi, multipliers m d/dt (rho phidot (cos, sin))."""
     scene = scenes.rolling_disk(mass=2.0, radius=0.5, steer_inertia=0.125, roll_inertia=0.25)
     q, v = scenes.rolling_disk.start(heading=0.7, steering=1.3, rolling=2.0)
-    dynamics = quick(lambda q, v, tau: constrained_dynamics(scene, q, v, tau))(q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9]))
+    dynamics = quick(lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau))(
+        q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9])
+    )
     turn, roll = 0.3 / 0.125, 0.9 / (0.25 + 2.0 * 0.25)
     c, s = np.cos(0.7), np.sin(0.7)
     forward = 0.5 * np.array([roll * c - 1.3 * 2.0 * s, roll * s + 1.3 * 2.0 * c])
@@ -394,9 +393,9 @@ def test_assemble_finds_the_nearest_configuration():
 
     @quick
     def solve(guess, rate):
-        computed = assemble(scene, guess, rate)
-        before, after = (mass_matrix(scene.system, x) for x in (guess, computed.q))
-        pull = before @ difference(scene.system, guess, computed.q)
+        computed = jd.assemble(scene, guess, rate)
+        before, after = (jd.mass_matrix(scene.system, x) for x in (guess, computed.q))
+        pull = before @ jd.difference(scene.system, guess, computed.q)
         return computed, pull, after @ (computed.v - rate), rows(scene, computed.q, computed.v, 0.0).A
 
     computed, pull, change, row = solve(guess, rate)
@@ -412,21 +411,21 @@ def test_assemble_finds_the_nearest_configuration():
 def test_assemble_fails_clearly():
     scene = scenes.four_bar(lengths=(1.0, 1.0, 1.0, 2.5))
     far = scene.system.replace(home=scene.system.home.at[2, 0, 3].set(4.0))
-    broken, guess = Scene(far, scene.constraints), jnp.asarray([0.3, -0.4, 2.0])
+    broken, guess = jd.Scene(far, scene.constraints), jnp.asarray([0.3, -0.4, 2.0])
     # The gap is 1 m at least, and the message gives the larger of its two components.
     with pytest.raises(ValueError, match=r"not assembled: loop 'knee' open by (0\.[7-9]|[1-9])"):
-        assemble(broken, guess)
+        jd.assemble(broken, guess)
 
     def fails(ground):
         model = scene.system.replace(home=far.home.at[2, 0, 3].set(ground))
-        return assemble(Scene(model, scene.constraints), guess).result == RESULTS.not_assembled
+        return jd.assemble(jd.Scene(model, scene.constraints), guess).result == jd.RESULTS.not_assembled
 
     codes = quick(jax.vmap(fails))(jnp.asarray([2.5, 4.0]))
     assert codes.tolist() == [False, True]
-    system = LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
-    both = [Holonomic(lambda q, t, x=x: q[0] - x, name=f"x = {x}") for x in (0.0, 1.0)]
+    system = jd.LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 2)
+    both = [jd.Holonomic(lambda q, t, x=x: q[0] - x, name=f"x = {x}") for x in (0.0, 1.0)]
     with pytest.raises(ValueError, match=r"not assembled: holonomic 'x = 0.0' open by 0.5, holonomic 'x = 1.0' open"):
-        assemble(Scene(system, both), jnp.asarray([0.2, 0.1]))
+        jd.assemble(jd.Scene(system, both), jnp.asarray([0.2, 0.1]))
 
 
 @pytest.mark.long
@@ -435,16 +434,16 @@ def test_assembling_with_a_joint_held():
     scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
     names = scene.system.joint_names
     wanted = float(q[0]) + 0.2
-    assembly = assemble(scene, q, v, hold={names[0]: wanted})
+    assembly = jd.assemble(scene, q, v, hold={names[0]: wanted})
     np.testing.assert_allclose(assembly.q[0], wanted, atol=1e-12)
     np.testing.assert_allclose(residuals(scene, assembly.q, assembly.v), 0, atol=1e-12)
     assert float(jnp.max(jnp.abs(assembly.v))) > 0.1
-    again = assemble(scene, assembly.q, assembly.v)
+    again = jd.assemble(scene, assembly.q, assembly.v)
     np.testing.assert_allclose(again.q, assembly.q, atol=1e-12)
     with pytest.raises(ValueError, match="'elbow9' is not in model"):
-        assemble(scene, q, hold={"elbow9": 0.1})
+        jd.assemble(scene, q, hold={"elbow9": 0.1})
     with pytest.raises(ValueError, match=r"not assembled: .*nor are they from 3 configurations"):
-        assemble(scene, q, hold={names[0]: wanted, names[1]: 2.9}, guesses=4)
+        jd.assemble(scene, q, hold={names[0]: wanted, names[1]: 2.9}, guesses=4)
 
 
 def test_a_tree_without_constraints_holds_what_it_is_told():
@@ -452,8 +451,8 @@ def test_a_tree_without_constraints_holds_what_it_is_told():
     arm, wanted = jd.robots.iiwa(), 0.5
     q, v = jnp.linspace(0.1, 0.4, 7), jnp.linspace(-1.0, 1.0, 7)
     for held in (
-        assemble(jd.Scene(arm), q, v, hold={"iiwa_joint_2": wanted}),
-        assemble(arm, q, v, hold={"iiwa_joint_2": wanted}),
+        jd.assemble(jd.Scene(arm), q, v, hold={"iiwa_joint_2": wanted}),
+        jd.assemble(arm, q, v, hold={"iiwa_joint_2": wanted}),
     ):
         # The least |e| in M with one entry given: e = M^-1 row^T (row M^-1 row^T)^-1 (wanted - q).
         column = jnp.linalg.inv(jd.mass_matrix(arm, q))[:, 1]
@@ -465,13 +464,13 @@ def test_a_tree_without_constraints_holds_what_it_is_told():
 def test_assembling_from_a_bad_guess():
     """Stretched out, the loop's equations do not say to which side it closes; a configuration beside it does."""
     scene, straight = scenes.four_bar(), jnp.zeros(3)
-    assert not bool(assemble(scene, straight, guesses=1, throw=False).success)
-    assembly = assemble(scene, straight)
+    assert not bool(jd.assemble(scene, straight, guesses=1, throw=False).success)
+    assembly = jd.assemble(scene, straight)
     assert assembly.guesses == 2
     np.testing.assert_allclose(residuals(scene, assembly.q, assembly.v), 0, atol=1e-12)
-    np.testing.assert_array_equal(assembly.q, assemble(scene, straight).q)
+    np.testing.assert_array_equal(assembly.q, jd.assemble(scene, straight).q)
     with pytest.raises(ValueError, match="guesses is 0"):
-        assemble(scene, straight, guesses=0)
+        jd.assemble(scene, straight, guesses=0)
 
 
 @pytest.mark.slow
@@ -485,7 +484,7 @@ def test_assembling_from_afar_is_differentiable(in_plane):
 
     def computed(x):
         model = scene.system.replace(home=scene.system.home.at[2, 0, 3].add(x[3]))
-        return jnp.vdot(weights, assemble(Scene(model, scene.constraints), guess + x[:3]).q)
+        return jnp.vdot(weights, jd.assemble(jd.Scene(model, scene.constraints), guess + x[:3]).q)
 
     def along(x):
         return jax.jvp(computed, (x,), (step,))[1]
@@ -510,10 +509,10 @@ def test_a_wheel_built_from_bodies_moves_as_the_disk_in_coordinates():
     builder = ModelBuilder("disk", gravity=None)
     builder.add_body("fork", None, "planar", (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), pose=(0.0, 0.0, rho))
     builder.add_body("wheel", "fork", "continuous", (mass, (0, 0, 0), (steer, roll, steer)), axis=(0.0, 1.0, 0.0))
-    wheel = rolling_wheel("wheel", ((0, 0, 0), (-np.pi / 2, 0, 0)), rho, contact=False)
-    scene = Scene(builder.build(), (wheel,))
+    wheel = jd.rolling_wheel("wheel", ((0, 0, 0), (-np.pi / 2, 0, 0)), rho, contact=False)
+    scene = jd.Scene(builder.build(), (wheel,))
     q, v = jnp.asarray([0.1, 0.2, 0.7, 0.3]), jnp.asarray([rho * 2.0, 0.0, 1.3, 2.0])
-    solve = quick(lambda scene, q, v, tau: (residuals(scene, q, v), constrained_dynamics(scene, q, v, tau)))
+    solve = quick(lambda scene, q, v, tau: (residuals(scene, q, v), jd.constrained_dynamics(scene, q, v, tau)))
     error, computed = solve(scene, q, v, jnp.asarray([0.0, 0.0, 0.3, 0.9]))
     assert float(error.max()) < 1e-14
     turn, rolling = 0.3 / steer, 0.9 / (roll + mass * rho**2)
@@ -525,11 +524,11 @@ def test_locked_joints_and_float32():
     """Locking all but one joint leaves a pendulum; in float32 the numbers keep their type."""
     q, _ = scenes.four_bar.start()
     model = scenes.four_bar().system
-    locked = Scene(model, (lock_joint("2", float(q[1])), lock_joint("3", float(q[2]))))
+    locked = jd.Scene(model, (jd.constraints.lock_joint("2", float(q[1])), jd.constraints.lock_joint("3", float(q[2]))))
     v = jnp.asarray([1.0, 0.0, 0.0])
-    solve = quick(lambda scene, q, v: constrained_dynamics(scene, q, v))
+    solve = quick(lambda scene, q, v: jd.constrained_dynamics(scene, q, v))
     solution = solve(locked, q, v)
-    M, h = quick(lambda q, v: (mass_matrix(model, q), bias_force(model, q, v)))(q, v)
+    M, h = quick(lambda q, v: (jd.mass_matrix(model, q), jd.bias_force(model, q, v)))(q, v)
     assert_close(solution.acceleration, [-h[0] / M[0, 0], 0.0, 0.0], 1e-13)
     single = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, locked)
     low = solve(single, q.astype(jnp.float32), v.astype(jnp.float32))

@@ -11,15 +11,11 @@ import pytest
 from jaxtyping import Array
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import scenes
-from jaxdyn.constraints import Holonomic
-from jaxdyn.simulation.methods import Reduced
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
 
 TS = jnp.asarray([0.0, 0.3])
-METHODS = {"projected": "projected", "multipliers": "multipliers", "reduced": "reduced", "crank": Reduced((0,))}
+METHODS = {"projected": "projected", "multipliers": "multipliers", "reduced": "reduced", "crank": jd.Reduced((0,))}
 
 
 def lagrangian(q, v, t, p):
@@ -56,8 +52,8 @@ def mechanism(x):
     """Scene and start for changes x of (J, m, a, b, the start's angle and rate, the crank's torque and its damping)."""
     a, b = 1.0 + x[2], 2.5 + x[3]
     parameters = {"J": 0.4 + x[0], "m": 1.5 + x[1], "a": a, "b": b}
-    system = LagrangianSystem(lagrangian, 3, parameters=parameters)
-    return Scene(system, (Holonomic(Pin(a, b), name="pin"),)), *closed(a, b, 1.0 + x[4], 3.0 + x[5])
+    system = jd.LagrangianSystem(lagrangian, 3, parameters=parameters)
+    return jd.Scene(system, (jd.Holonomic(Pin(a, b), name="pin"),)), *closed(a, b, 1.0 + x[4], 3.0 + x[5])
 
 
 def torque(p, q, v, t):
@@ -69,7 +65,7 @@ def final(x, method="projected", adjoint=None):
     """q and v at the end, (6,)."""
     scene, q, v = mechanism(x)
     control = jax.tree_util.Partial(torque, x[6:])
-    solution = simulate(scene, q, v, TS, control=control, method=method, stepsize=0.01, adjoint=adjoint)
+    solution = jd.simulate(scene, q, v, TS, control=control, method=method, stepsize=0.01, adjoint=adjoint)
     return jnp.concatenate([solution.q[-1], solution.v[-1]])
 
 
@@ -114,7 +110,7 @@ def test_a_thousand_mechanisms_of_different_lengths():
 
     def run(x):
         scene, q, v = mechanism(x)
-        solution = simulate(scene, q, v, TS, stepsize=0.01, outputs=("constraint_residual", "energy"))
+        solution = jd.simulate(scene, q, v, TS, stepsize=0.01, outputs=("constraint_residual", "energy"))
         q, v = solution.q[-1], solution.v[-1]
         return q, v, solution.success, solution.constraint_residual.max(), closed(1.0 + x[2], 2.5 + x[3], q[0], v[0])
 
@@ -136,8 +132,8 @@ def test_derivatives_of_a_mechanism_of_bodies(method):
 
     def final(x):
         model = base.system.replace(inertias=base.system.inertias.at[1].multiply(1.0 + x[0]))
-        scene = Scene(model, base.constraints)
-        solution = simulate(scene, q, v * (1.0 + x[1]), TS, stepsize=0.02, method=method)
+        scene = jd.Scene(model, base.constraints)
+        solution = jd.simulate(scene, q, v * (1.0 + x[1]), TS, stepsize=0.02, method=method)
         return jnp.concatenate([solution.q[-1], solution.v[-1]])
 
     slope = quick(jax.jacrev(final))(jnp.zeros(2))

@@ -9,15 +9,11 @@ from pinocchio_bridge import assert_close, quick, random_states, random_tree
 import jaxdyn as jd
 from benchmarks.report_cases import test_set
 from jaxdyn import scenes, se3
-from jaxdyn.constraints import loop
 from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.base import rows
-from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
+from jaxdyn.constraints.dynamics import solve_rows
 from jaxdyn.constraints.projection import project_state
-from jaxdyn.dynamics.quantities import bias_force, mass_matrix
-from jaxdyn.model.configuration import integrate
 from jaxdyn.simulation.methods import consistent
-from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract
 
 pytestmark = pytest.mark.native
@@ -39,8 +35,8 @@ def mechanism(name):
     """A scene with loops that are open where the states are: the equations hold there as well."""
     bodies = 7 if name == "few" else 8  # none of whose loops is at the last one
     model = random_tree(5, KINDS[:bodies], parents=PARENTS[:bodies])
-    loops = [loop(a, POSE, b, OTHER, joint, in_plane=name == "in plane") for a, b, joint in JOINTS[name]]
-    return Scene(model, loops)
+    loops = [jd.loop(a, POSE, b, OTHER, joint, in_plane=name == "in plane") for a, b, joint in JOINTS[name]]
+    return jd.Scene(model, loops)
 
 
 def dense(scene, q, v, tau, t=0.0):
@@ -59,14 +55,14 @@ def solved(request):
     q, v, tau = random_states(scene.system, 3, 1)[:3]
 
     def computed(q, v, tau):
-        return constrained_dynamics(scene, q, v, tau), constrained_dynamics(scene, q, v, tau, method="schur")
+        return jd.constrained_dynamics(scene, q, v, tau), jd.constrained_dynamics(scene, q, v, tau, method="schur")
 
     def wanted(q, v, tau):
         row = rows(scene, q, v)
         return (
             solve_rows(scene, q, v, tau, 0.0, row),
-            mass_matrix(scene.system, q),
-            bias_force(scene.system, q, v),
+            jd.mass_matrix(scene.system, q),
+            jd.bias_force(scene.system, q, v),
             row.A,
             row.gamma,
         )
@@ -102,7 +98,7 @@ def test_equations_of_motion_and_rows_hold(solved):
 def test_derivatives_are_those_of_the_dense_solve(method):
     """In masses, poses of a loop, states and forces; the dense solve in plain mode."""
     model = random_tree(5, ("revolute", "spherical", "helical"), parents=(-1, 0, 0))
-    scene = Scene(model, (loop("b1", POSE, "b2", OTHER, "universal"),))
+    scene = jd.Scene(model, (jd.loop("b1", POSE, "b2", OTHER, "universal"),))
     q0, v, tau = (x[0] for x in random_states(scene.system, 3, 0)[:3])
     rng = np.random.default_rng(3)
     weights = jnp.asarray(rng.normal(size=scene.nv)), jnp.asarray(rng.normal(size=4))
@@ -110,9 +106,9 @@ def test_derivatives_are_those_of_the_dense_solve(method):
     def value(inertias, twist, dq, v, tau, solve):
         # Poses and quaternions move on their manifolds: off them the two are different functions.
         first, *others = scene.constraints
-        pose, q = first.pose_a @ se3.exp(twist), integrate(scene.system, q0, dq)
+        pose, q = first.pose_a @ se3.exp(twist), jd.integrate(scene.system, q0, dq)
         first = type(first)(first.name, first.joint, first.body_a, first.body_b, first.in_plane, pose, first.pose_b)
-        computed = solve(Scene(scene.system.replace(inertias=inertias), (first, *others)), q, v, tau)
+        computed = solve(jd.Scene(scene.system.replace(inertias=inertias), (first, *others)), q, v, tau)
         return jnp.vdot(weights[0], computed.acceleration) + jnp.vdot(weights[1], computed.multipliers)
 
     at = scene.system.inertias, jnp.zeros(6), jnp.zeros(scene.nv), v, tau
@@ -126,7 +122,7 @@ def test_derivatives_are_those_of_the_dense_solve(method):
             )
         )(*at)
 
-    computed = jax.tree.leaves(derivatives(lambda *x: constrained_dynamics(*x, method=method)))
+    computed = jax.tree.leaves(derivatives(lambda *x: jd.constrained_dynamics(*x, method=method)))
     with jd.compilation("plain"):
         want = jax.tree.leaves(derivatives(dense))
     for x, y in zip(computed, want, strict=True):
@@ -150,7 +146,7 @@ def test_a_singular_sample_is_solved_with_its_rank():
     scene, q, v0 = two_windows()
 
     def run(q):
-        computed = constrained_dynamics(scene, q, v0, jnp.zeros(5))
+        computed = jd.constrained_dynamics(scene, q, v0, jnp.zeros(5))
         return computed.acceleration, computed.multipliers, computed.rank
 
     def wanted(q):
@@ -158,7 +154,9 @@ def test_a_singular_sample_is_solved_with_its_rank():
         return computed.acceleration, computed.multipliers, computed.rank
 
     program = quick(jax.vmap(run))
-    schur = jax.jit(jax.vmap(lambda q: constrained_dynamics(scene, q, v0, jnp.zeros(5), method="schur").acceleration))
+    schur = jax.jit(
+        jax.vmap(lambda q: jd.constrained_dynamics(scene, q, v0, jnp.zeros(5), method="schur").acceleration)
+    )
     assert "lapack" not in schur.lower(q).as_text()  # no factorisation is called
     with_singular = q.at[1].set(FLAT)
     with jd.compilation("plain"):
@@ -182,7 +180,7 @@ def test_a_sample_is_not_changed_by_a_singular_one_beside_it():
     @jax.jit
     @jax.vmap
     def run(q):
-        dynamics = constrained_dynamics(scene, q, v0, jnp.zeros(5))
+        dynamics = jd.constrained_dynamics(scene, q, v0, jnp.zeros(5))
         return dynamics.acceleration, dynamics.multipliers, project_state(scene, q, v0, jnp.asarray(0.0))
 
     others = np.array([0, 2, 3])
@@ -199,7 +197,7 @@ def test_gradients_beside_a_singular_sample():
         one = jax.grad(lambda q, tau: jnp.sum(turn * solve(scene, q, v0, tau).acceleration), (0, 1))
         return jax.jit(lambda: jax.vmap(one, (0, None))(q, jnp.zeros(5)))()
 
-    computed = pulled(constrained_dynamics)
+    computed = pulled(jd.constrained_dynamics)
     with jd.compilation("plain"):
         want = pulled(dense)
     for x, y in zip(computed, want, strict=True):
@@ -252,7 +250,7 @@ def test_systems_of_equations(name):
     along = jnp.sin(jnp.arange(float(scene.nv)) + 0.5)
 
     def dynamics(tau):
-        return constrained_dynamics(scene, q, v, tau, t)
+        return jd.constrained_dynamics(scene, q, v, tau, t)
 
     def everything(tau):
         slope = jax.jvp(lambda tau: dynamics(tau).acceleration, (tau,), (along,))[1]
@@ -274,7 +272,7 @@ def test_dependent_rows_are_left_to_the_careful_way():
     """A row that is given twice: the kernel's pivots say so, and the multipliers are those of least norm."""
     scene, q, v = at_start("rolling_disk")
     twice = jd.Scene(scene.system, (*scene.constraints, *scene.constraints[:1]))
-    dynamics, once = quick(lambda q, v: [constrained_dynamics(x, q, v) for x in (twice, scene)])(q, v)
+    dynamics, once = quick(lambda q, v: [jd.constrained_dynamics(x, q, v) for x in (twice, scene)])(q, v)
     wanted = quick(lambda q, v: dense(twice, q, v, 0 * v))(q, v)
     assert int(dynamics.rank) == 2
     np.testing.assert_allclose(dynamics.acceleration, wanted.acceleration, atol=1e-10)
@@ -296,10 +294,10 @@ def test_forces_with_effects_have_them_in_every_call():
     heard.clear()
     scene, q, v = at_start("rolling_disk")
     loud = jd.Scene(scene.system, scene.constraints, (spoken,))
-    run = jax.jit(lambda q, v: constrained_dynamics(loud, q, v))
+    run = jax.jit(lambda q, v: jd.constrained_dynamics(loud, q, v))
     assert not heard and "jaxdyn_kernel" in run.lower(q, v).as_text()  # the rest runs in one
     with jd.compilation("plain"):
-        assert not has_kernel(lambda q, v: constrained_dynamics(scene, q, v), q, v)
+        assert not has_kernel(lambda q, v: jd.constrained_dynamics(scene, q, v), q, v)
     for speed in (1.0, 2.0):
         computed = run(q, v.at[0].set(speed))
     jax.effects_barrier()

@@ -8,23 +8,7 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn import inertia, se3
-from jaxdyn.constraints import (
-    Holonomic,
-    Pfaffian,
-    distance,
-    gear,
-    knife_edge,
-    lock_joint,
-    loop,
-    model_couplings,
-    rolling_sphere,
-    rolling_wheel,
-)
-from jaxdyn.constraints.base import constraint_jacobian, layout, position_residual, rows, velocity_residual
-from jaxdyn.dynamics.kinematics import forward_kinematics
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.configuration import configuration_rate, difference, integrate
-from jaxdyn.systems.scene import Scene
+from jaxdyn.constraints.base import layout, position_residual, rows, velocity_residual
 
 # Twists (v, omega) that each joint leaves free, in frame B.
 FREE = {
@@ -42,7 +26,7 @@ POSE_A, POSE_B = ((0.3, -0.1, 0.2), (0.4, -0.7, 1.1)), ((-0.2, 0.1, 0.5), (-1.0,
 @pytest.fixture(scope="module")
 def pair():
     """Two free bodies, and one on a second tree with revolute, prismatic and spherical joints."""
-    builder = ModelBuilder("pair")
+    builder = jd.ModelBuilder("pair")
     brick = inertia.box(1.0, (0.2, 0.3, 0.4))
     builder.add_body("a", None, "free", brick).add_body("b", None, "free", brick)
     builder.add_body("c", None, "revolute", brick, axis=(0, 1, 1), pose=(0.1, 0.2, 0.3))
@@ -63,36 +47,39 @@ def state(pair):
 
 def all_constraints():
     """One of each kind, most of them violated: rows do not depend on that."""
-    closing = [loop("a", POSE_A, "b", POSE_B, joint, name=joint) for joint in (*FREE, "universal")]
+    closing = [jd.loop("a", POSE_A, "b", POSE_B, joint, name=joint) for joint in (*FREE, "universal")]
     flat = [
-        loop("a", POSE_A, "grip", None, j, in_plane=True, name=f"flat {j}") for j in ("revolute", "prismatic", "weld")
+        jd.loop("a", POSE_A, "grip", None, j, in_plane=True, name=f"flat {j}")
+        for j in ("revolute", "prismatic", "weld")
     ]
     return (
         *closing,
         *flat,
-        loop(None, POSE_A, "grip", POSE_B, "weld", name="to world"),
-        distance("a", (0.1, 0.2, 0.3), "d", None, 0.7),
-        gear("c_joint", "d_joint", 2.5, 0.1),
-        lock_joint("c_joint", 0.3),
-        lock_joint("e_joint", (0.8, 0.6, 0.0, 0.0)),
-        rolling_wheel("a", POSE_A, 0.3, plane=((0.0, 0.1, 0.0), (0.1, 0.2, 0.0))),
-        rolling_wheel("a", POSE_A, 0.3, plane_body="d", lateral=False, name="half wheel"),
-        rolling_sphere("b", (0.1, 0.0, 0.0), 0.2, spin=True),
-        rolling_sphere("b", None, 0.2, on="sphere", surface_body="grip", surface_radius=0.5, name="on ball"),
-        rolling_sphere("b", None, 0.2, on="sphere", surface_radius=4.0, inside=True, name="in ball"),
-        rolling_sphere("b", None, 0.2, on="cylinder", surface=POSE_A, surface_radius=0.4, name="on pipe"),
-        rolling_sphere("b", None, 0.2, on="cylinder", surface_radius=0.9, inside=True, contact=False, name="in pipe"),
-        knife_edge("a", POSE_B, plane=POSE_A),
-        Holonomic(lambda q, t: jnp.stack([q[0] * q[7] - t**2, jnp.sin(q[3] + t)]), name="moving"),
-        Holonomic(lambda model, q, t: forward_kinematics(model, q)[4, 0, 3], with_system=True, name="by system"),
-        Pfaffian(lambda q, t: jnp.outer(q[:2], q[1:18]) * (1 + t), lambda q, t: jnp.stack([jnp.cos(t), q[0]])),
+        jd.loop(None, POSE_A, "grip", POSE_B, "weld", name="to world"),
+        jd.constraints.distance("a", (0.1, 0.2, 0.3), "d", None, 0.7),
+        jd.constraints.gear("c_joint", "d_joint", 2.5, 0.1),
+        jd.constraints.lock_joint("c_joint", 0.3),
+        jd.constraints.lock_joint("e_joint", (0.8, 0.6, 0.0, 0.0)),
+        jd.rolling_wheel("a", POSE_A, 0.3, plane=((0.0, 0.1, 0.0), (0.1, 0.2, 0.0))),
+        jd.rolling_wheel("a", POSE_A, 0.3, plane_body="d", lateral=False, name="half wheel"),
+        jd.rolling_sphere("b", (0.1, 0.0, 0.0), 0.2, spin=True),
+        jd.rolling_sphere("b", None, 0.2, on="sphere", surface_body="grip", surface_radius=0.5, name="on ball"),
+        jd.rolling_sphere("b", None, 0.2, on="sphere", surface_radius=4.0, inside=True, name="in ball"),
+        jd.rolling_sphere("b", None, 0.2, on="cylinder", surface=POSE_A, surface_radius=0.4, name="on pipe"),
+        jd.rolling_sphere(
+            "b", None, 0.2, on="cylinder", surface_radius=0.9, inside=True, contact=False, name="in pipe"
+        ),
+        jd.constraints.knife_edge("a", POSE_B, plane=POSE_A),
+        jd.Holonomic(lambda q, t: jnp.stack([q[0] * q[7] - t**2, jnp.sin(q[3] + t)]), name="moving"),
+        jd.Holonomic(lambda model, q, t: jd.forward_kinematics(model, q)[4, 0, 3], with_system=True, name="by system"),
+        jd.Pfaffian(lambda q, t: jnp.outer(q[:2], q[1:18]) * (1 + t), lambda q, t: jnp.stack([jnp.cos(t), q[0]])),
     )
 
 
 @pytest.fixture(scope="module")
 def everything(pair, state):
     """Names and places, and rows and residuals of all constraints as a function of the state and the time."""
-    scene = Scene(pair, all_constraints())
+    scene = jd.Scene(pair, all_constraints())
 
     @quick
     def evaluate(q, v, t):
@@ -110,7 +97,7 @@ def everything(pair, state):
 
 def moved(model, q, v, dt):
     """Configuration on the curve of constant body velocity through q."""
-    return integrate(model, q, v, dt)
+    return jd.integrate(model, q, v, dt)
 
 
 def fourth_order(function, h):
@@ -150,11 +137,11 @@ def test_loops_remove_what_the_joint_removes_and_nothing_else(pair, state, every
         quarter = np.asarray(se3.exp(jnp.asarray([0, 0, 0, np.pi / 2, 0, 0])))
         relative = first @ quarter @ second
         free = [np.eye(6)[5], np.concatenate([np.zeros(3), relative[:3, :3].T[:, 2]])]
-    pose_a, pose_b = (np.asarray(loop("a", POSE_A, "b", POSE_B).__dict__[k]) for k in ("pose_a", "pose_b"))
-    T_a = np.asarray(forward_kinematics(pair, q)[0])
+    pose_a, pose_b = (np.asarray(jd.loop("a", POSE_A, "b", POSE_B).__dict__[k]) for k in ("pose_a", "pose_b"))
+    T_a = np.asarray(jd.forward_kinematics(pair, q)[0])
     T_b = T_a @ pose_a @ relative @ np.linalg.inv(pose_b)
-    step = difference(pair, q, q.at[7:14].set(jnp.asarray([*T_b[:3, 3], *quaternion(T_b[:3, :3])])))
-    computed = evaluate(integrate(pair, q, step), jnp.zeros(pair.nv), 0.0)
+    step = jd.difference(pair, q, q.at[7:14].set(jnp.asarray([*T_b[:3, 3], *quaternion(T_b[:3, :3])])))
+    computed = evaluate(jd.integrate(pair, q, step), jnp.zeros(pair.nv), 0.0)
     held = [p for p in places if p.nonholonomic > p.start]
     first = sum(p.nonholonomic - p.start for p in held[: held.index(place)])
     count = place.end - place.start
@@ -184,11 +171,11 @@ def test_rolling_rows_are_velocities_of_the_touching_points(pair, state, everyth
     """Velocities of the two material points in contact by differences of poses, for points computed by hand."""
     (q, v), (places, evaluate) = state, everything
     psi = np.asarray(evaluate(q, v, 0.0)["psi"])
-    fk = quick(lambda q: forward_kinematics(pair, q))
+    fk = quick(lambda q: jd.forward_kinematics(pair, q))
     names = list(pair.body_names)
 
     def pose(body, q, offset):
-        local = np.asarray(loop("a", offset, "b", None).__dict__["pose_a"])
+        local = np.asarray(jd.loop("a", offset, "b", None).__dict__["pose_a"])
         return (np.asarray(fk(q))[names.index(body)] if body else np.eye(4)) @ local
 
     def velocity(body, point):
@@ -225,65 +212,74 @@ def test_rolling_rows_are_velocities_of_the_touching_points(pair, state, everyth
 
 
 def test_a_wheel_lying_flat_has_finite_rows_and_derivatives():
-    builder = ModelBuilder("flat").add_body("wheel", None, "free", inertia.cylinder(1.0, 0.3, 0.02))
+    builder = jd.ModelBuilder("flat").add_body("wheel", None, "free", inertia.cylinder(1.0, 0.3, 0.02))
     model = builder.build()
-    scene = Scene(model, (rolling_wheel("wheel", None, 0.3), knife_edge("wheel", ((0, 0, 0), (0, -np.pi / 2, 0)))))
+    scene = jd.Scene(
+        model,
+        (jd.rolling_wheel("wheel", None, 0.3), jd.constraints.knife_edge("wheel", ((0, 0, 0), (0, -np.pi / 2, 0)))),
+    )
     q, v = jnp.asarray([0, 0, 0.0, 1, 0, 0, 0]), jnp.ones(6)
     total = quick(
-        jax.value_and_grad(lambda q: jnp.sum(rows(scene, q, v, 0.0).gamma) + jnp.sum(constraint_jacobian(scene, q)))
+        jax.value_and_grad(lambda q: jnp.sum(rows(scene, q, v, 0.0).gamma) + jnp.sum(jd.constraint_jacobian(scene, q)))
     )
     value, slope = total(q)
     assert np.isfinite(value) and np.isfinite(slope).all()
 
 
 def test_couplings_of_a_model_become_gears():
-    builder = ModelBuilder("pair")
+    builder = jd.ModelBuilder("pair")
     for name in ("p", "q"):
         builder.add_body(name, None, "revolute", inertia.box(1.0, (1, 1, 1)))
     builder.add_coupling("q_joint", "p_joint", -2.0, 0.3)
     model = builder.build()
-    computed = quick(lambda q: position_residual(Scene(model, model_couplings(model)), q))(jnp.asarray([0.5, 0.7]))
+    computed = quick(lambda q: position_residual(jd.Scene(model, jd.constraints.model_couplings(model)), q))(
+        jnp.asarray([0.5, 0.7])
+    )
     assert_close(computed, [0.7 + 2.0 * 0.5 - 0.3], 1e-15)
 
 
 def test_quaternion_rates_enter_rows_on_the_manifold(pair, state):
     """A v is the derivative of phi along dq/dt = H(q) v."""
     q, v = state
-    scene = Scene(pair, (Holonomic(lambda q, t: jnp.sum(q**3), name="cubes"),))
-    want = 3 * jnp.sum(q**2 * configuration_rate(pair, q, v))
-    assert_close(quick(lambda q, v: constraint_jacobian(scene, q) @ v)(q, v), want[None], 1e-13)
+    scene = jd.Scene(pair, (jd.Holonomic(lambda q, t: jnp.sum(q**3), name="cubes"),))
+    want = 3 * jnp.sum(q**2 * jd.configuration_rate(pair, q, v))
+    assert_close(quick(lambda q, v: jd.constraint_jacobian(scene, q) @ v)(q, v), want[None], 1e-13)
 
 
 def test_names_and_refusals(pair):
-    twice = Scene(pair, (lock_joint("c_joint"), lock_joint("c_joint")))
+    twice = jd.Scene(pair, (jd.constraints.lock_joint("c_joint"), jd.constraints.lock_joint("c_joint")))
     assert [p.name for p in layout(twice)] == ["lock c_joint", "lock c_joint (1)"]
     q, v = jnp.zeros(pair.nq).at[jnp.array([3, 10, 16])].set(1.0), jnp.zeros(pair.nv)
     bad = {
         "constraints\\[0\\] is a function; wrap": (lambda q, t: q[:1],),
-        "'empty' has no rows": (Holonomic(lambda q, t: q[:0], name="empty"),),
-        "'x': phi returned shape \\(2, 2\\)": (Holonomic(lambda q, t: jnp.eye(2), name="x"),),
-        "'y': A returned shape \\(1, 3\\), expected \\(n, 17\\)": (Pfaffian(lambda q, t: jnp.ones((1, 3)), name="y"),),
-        "'y': b returned shape \\(2,\\), expected \\(1,\\)": (
-            Pfaffian(lambda q, t: jnp.ones((1, 17)), lambda q, t: q[:2], name="y"),
+        "'empty' has no rows": (jd.Holonomic(lambda q, t: q[:0], name="empty"),),
+        "'x': phi returned shape \\(2, 2\\)": (jd.Holonomic(lambda q, t: jnp.eye(2), name="x"),),
+        "'y': A returned shape \\(1, 3\\), expected \\(n, 17\\)": (
+            jd.Pfaffian(lambda q, t: jnp.ones((1, 3)), name="y"),
         ),
-        "'a-zz': frame 'zz' is not in model 'pair'": (loop("a", None, "zz", None),),
-        "'gear c_joint-e_joint': joint 'e_joint' is spherical": (gear("c_joint", "e_joint", 1.0),),
-        "'lock nn': joint 'nn' is not in model": (lock_joint("nn"),),
-        "value has shape \\(1,\\), but joint 'e_joint' is spherical with 4": (lock_joint("e_joint", 0.0),),
+        "'y': b returned shape \\(2,\\), expected \\(1,\\)": (
+            jd.Pfaffian(lambda q, t: jnp.ones((1, 17)), lambda q, t: q[:2], name="y"),
+        ),
+        "'a-zz': frame 'zz' is not in model 'pair'": (jd.loop("a", None, "zz", None),),
+        "'gear c_joint-e_joint': joint 'e_joint' is spherical": (jd.constraints.gear("c_joint", "e_joint", 1.0),),
+        "'lock nn': joint 'nn' is not in model": (jd.constraints.lock_joint("nn"),),
+        "value has shape \\(1,\\), but joint 'e_joint' is spherical with 4": (
+            jd.constraints.lock_joint("e_joint", 0.0),
+        ),
     }
     for message, constraints in bad.items():
         with pytest.raises(ValueError, match=message):
-            rows(Scene(pair, constraints), q, v, 0.0)
+            rows(jd.Scene(pair, constraints), q, v, 0.0)
     made = {
-        "joint 'hinge' is unknown; choose from": lambda: loop("a", None, "b", None, "hinge"),
-        "both frames are on 'a'": lambda: loop("a", None, "a", None),
-        "length is 0": lambda: distance("a", None, "b", None, 0.0),
-        "radius is -1": lambda: rolling_wheel("a", None, -1.0),
-        "surface_radius is None on a sphere": lambda: rolling_sphere("a", None, 1.0, on="sphere"),
-        "does not fit inside": lambda: rolling_sphere("a", None, 2.0, on="sphere", surface_radius=1.0, inside=True),
-        "name is ''": lambda: Holonomic(lambda q, t: q, name=""),
-        "phi is 3, which cannot be called": lambda: Holonomic(3),
-        "both joints are 'c_joint'": lambda: gear("c_joint", "c_joint", 1.0),
+        "joint 'hinge' is unknown; choose from": lambda: jd.loop("a", None, "b", None, "hinge"),
+        "both frames are on 'a'": lambda: jd.loop("a", None, "a", None),
+        "length is 0": lambda: jd.constraints.distance("a", None, "b", None, 0.0),
+        "radius is -1": lambda: jd.rolling_wheel("a", None, -1.0),
+        "surface_radius is None on a sphere": lambda: jd.rolling_sphere("a", None, 1.0, on="sphere"),
+        "does not fit inside": lambda: jd.rolling_sphere("a", None, 2.0, on="sphere", surface_radius=1.0, inside=True),
+        "name is ''": lambda: jd.Holonomic(lambda q, t: q, name=""),
+        "phi is 3, which cannot be called": lambda: jd.Holonomic(3),
+        "both joints are 'c_joint'": lambda: jd.constraints.gear("c_joint", "c_joint", 1.0),
     }
     for message, make in made.items():
         with pytest.raises(ValueError, match=message):

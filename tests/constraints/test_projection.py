@@ -15,17 +15,9 @@ from benchmarks.report_cases import test_set
 from jaxdyn import scenes
 from jaxdyn.constraints import projection
 from jaxdyn.constraints.assembly import residuals
-from jaxdyn.constraints.base import (
-    constraint_jacobian,
-    holonomic_rows,
-    layout,
-    position_residual,
-    velocity_residual,
-)
+from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.projection import project_state, project_step
-from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
 # With the slow tests also without kernels.
@@ -86,7 +78,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
     def both(q, v):
         computed = project_state(scene, q, v, zero, rank_tol)
         fixed = in_fixed_steps(rank_tol, scene, q, v, zero)
-        M, A = mass_matrix(scene.system, computed[0]), constraint_jacobian(scene, computed[0])
+        M, A = jd.mass_matrix(scene.system, computed[0]), jd.constraint_jacobian(scene, computed[0])
         return computed, fixed, residuals(scene, *computed), (M, A)
 
     (place, speed), fixed, left, (M, A) = quick(jax.vmap(both))(q, v)
@@ -122,7 +114,11 @@ def test_errors_of_a_step_lose_what_the_projection_removes(name, parameters, mod
             return project_step(scene, q, v, zero, errors)
 
         by_derivative = jax.jvp(lambda q: jax.vmap(lambda *e: project_step(scene, q, v, zero, e))(*errors), (q,), (q,))
-        return jax.vmap(step)(*errors), by_derivative, (mass_matrix(scene.system, q), constraint_jacobian(scene, q))
+        return (
+            jax.vmap(step)(*errors),
+            by_derivative,
+            (jd.mass_matrix(scene.system, q), jd.constraint_jacobian(scene, q)),
+        )
 
     computed, by_derivative, (M, A) = both(errors)
     M, A = np.asarray(M), np.asarray(A)
@@ -205,7 +201,7 @@ def test_derivatives_are_those_of_the_steps():
     weights = [jnp.asarray(rng.normal(size=x.shape)) for x in (q, v)]
 
     def value(inertias, q, v, way):
-        here = Scene(scene.system.replace(inertias=inertias), scene.constraints)
+        here = jd.Scene(scene.system.replace(inertias=inertias), scene.constraints)
         return sum(jnp.vdot(w, x) for w, x in zip(weights, way(here, q, v, jnp.asarray(0.0)), strict=True))
 
     def fixed(scene, q, v, t):

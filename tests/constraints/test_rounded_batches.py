@@ -41,7 +41,9 @@ def at_angle(scene, angle):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["dynamics", pytest.param("step", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["dynamics", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("step", "jacobian"))]
+)
 def test_exported_code_chooses_the_rows(folder, kind):
     """Of four rows that count and one that repeats them there is no regular solution without the choice."""
     _, (scene, q, v), _ = pair("four_bar", 5, folder)
@@ -52,11 +54,12 @@ def test_exported_code_chooses_the_rows(folder, kind):
         motion = jd.constrained_dynamics(scene, q, v, tau)
         return motion.acceleration, motion.multipliers
 
-    function = solve if kind == "dynamics" else lambda q, v, tau: step((q, v), tau)
-    exported = jd.export(function, q, v, tau, name="bars", derivatives=("jacobian",))
+    function = solve if kind != "step" else lambda q, v, tau: step((q, v), tau)
+    given = {"derivatives": ("jacobian",)} if kind == "jacobian" else {}
+    exported = jd.export(function, q, v, tau, name="bars", **given)
     for got, want in zip(exported(q, v, tau), function(*map(jnp.asarray, (q, v, tau))), strict=True):
         np.testing.assert_allclose(got, want, atol=1e-10)
-    if kind == "step":
+    if kind != "jacobian":
         return
     derivatives = exported.jacobian(q, v, tau)
     wanted = jax.jit(jax.jacfwd(solve, argnums=(0, 1, 2)))(q, v, tau)
@@ -123,7 +126,7 @@ def test_second_derivatives_and_float32_are_those_of_the_exact_mechanism(folder)
     np.testing.assert_allclose(motion.acceleration, jd.constrained_dynamics(scene, q, v).acceleration, rtol=1e-5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_grasps_of_a_rounded_hand_are_those_of_the_exact_one():
     """A planar hand whose contacts have rows in space, and the same with one finger out of its plane by the rounding."""
     bars, (q, v) = jd.scenes.hand_with_bar(mu=None), jd.scenes.hand_with_bar.start()

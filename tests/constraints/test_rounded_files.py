@@ -171,13 +171,12 @@ def exact(tmp_path_factory):
     [
         ("sdf", 8),
         ("urdf_3d", 5),
-        ("gazebo", 4),
         ("mjcf", 6),
         *(
             pytest.param(kind, digits, marks=pytest.mark.slow)
             for kind in WRITERS
             for digits in (4, 5, 6, 8, 12)
-            if (kind, digits) not in (("sdf", 8), ("urdf_3d", 5), ("gazebo", 4), ("mjcf", 6))
+            if (kind, digits) not in (("sdf", 8), ("urdf_3d", 5), ("mjcf", 6))
         ),
     ],
 )

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from jaxdyn.contact import force_closure_of_map, friction_cone, wrench_basis, wrench_cone
+import jaxdyn as jd
 
-HARD, SOFT = friction_cone("hard-finger", 0.5), friction_cone("soft-finger", 0.5, 0.02)
+HARD, SOFT = jd.contact.friction_cone("hard-finger", 0.5), jd.contact.friction_cone("soft-finger", 0.5, 0.02)
 
 
 def frame(normal):
@@ -25,7 +25,7 @@ def grasp(points, normals, kind):
     for point, normal in zip(np.asarray(points), np.asarray(normals), strict=True):
         R = frame(normal)
         hat = np.array([[0, -point[2], point[1]], [point[2], 0, -point[0]], [-point[1], point[0], 0]])
-        columns.append(np.block([[R, np.zeros((3, 3))], [hat @ R, R]]) @ np.asarray(wrench_basis(kind)))
+        columns.append(np.block([[R, np.zeros((3, 3))], [hat @ R, R]]) @ np.asarray(jd.contact.wrench_basis(kind)))
     return np.concatenate(columns, 1)
 
 
@@ -71,7 +71,7 @@ ANTIPODAL = [[0.1, 0, 0], [-0.1, 0, 0]], [[-1.0, 0, 0], [1.0, 0, 0]]
 
 
 def test_two_soft_fingers_that_oppose_each_other_close():
-    computed = force_closure_of_map(grasp(*ANTIPODAL, "soft-finger"), [SOFT] * 2)
+    computed = jd.contact.force_closure_of_map(grasp(*ANTIPODAL, "soft-finger"), [SOFT] * 2)
     assert computed.closed and computed.rank == 6
     # They press with half a newton each; the torque that they may exert is the tighter margin, 0.02 m x 0.5 N.
     np.testing.assert_allclose(computed.margin, 0.01, atol=1e-9)
@@ -79,31 +79,31 @@ def test_two_soft_fingers_that_oppose_each_other_close():
 
 
 def test_two_hard_fingers_do_not_resist_a_torque_about_their_line():
-    computed = force_closure_of_map(grasp(*ANTIPODAL, "hard-finger"), [HARD] * 2)
+    computed = jd.contact.force_closure_of_map(grasp(*ANTIPODAL, "hard-finger"), [HARD] * 2)
     assert not computed.closed and computed.rank == 5 and computed.margin == 0
     np.testing.assert_allclose(np.abs(computed.direction), [0, 0, 0, 1, 0, 0], atol=1e-12)
 
 
 def test_three_hard_fingers_close_by_a_third_of_their_friction():
     G = grasp(*three(), "hard-finger")
-    computed = force_closure_of_map(G, [HARD] * 3)
+    computed = jd.contact.force_closure_of_map(G, [HARD] * 3)
     assert computed.closed
     # By symmetry each presses with a third of a newton along its normal.
     np.testing.assert_allclose(computed.margin, 0.5 / 3, atol=1e-9)
     np.testing.assert_allclose(G @ computed.forces, 0, atol=1e-9)
     # Without friction their lines lie in a plane and meet in a point: what they resist are forces in that plane.
-    smooth = force_closure_of_map(G, [friction_cone("hard-finger", 0.0)] * 3)
+    smooth = jd.contact.force_closure_of_map(G, [jd.contact.friction_cone("hard-finger", 0.0)] * 3)
     assert not smooth.closed and smooth.rank == 2
 
 
 def test_feet_and_rigid_grips():
-    foot = wrench_cone(0.1, 0.05, 0.5)
-    alone = force_closure_of_map(np.eye(6), [foot])
+    foot = jd.contact.wrench_cone(0.1, 0.05, 0.5)
+    alone = jd.contact.force_closure_of_map(np.eye(6), [foot])
     assert not alone.closed
     assert ((np.linalg.svd(np.asarray(foot))[2] @ alone.direction) ** 2).sum() > 0  # a direction in space
     np.testing.assert_allclose(alone.direction, [0, 0, 1, 0, 0, 0], atol=1e-9)
-    assert force_closure_of_map(np.concatenate([np.eye(6), -np.eye(6)], 1), [foot, foot]).closed
-    rigid = force_closure_of_map(np.eye(6), [friction_cone("rigid")])
+    assert jd.contact.force_closure_of_map(np.concatenate([np.eye(6), -np.eye(6)], 1), [foot, foot]).closed
+    rigid = jd.contact.force_closure_of_map(np.eye(6), [jd.contact.friction_cone("rigid")])
     assert rigid.closed and rigid.margin == np.inf
 
 
@@ -113,30 +113,30 @@ def test_seven_points_without_friction_close_and_six_do_not():
         [[1, 0.3, 0], [-1, -0.3, 0], [0, 1, 0.3], [0, -1, -0.3], [0.3, 0, 1], [-0.3, 0, -1], [-1, 0.8, 0.5]]
     )
     normals = np.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1], [1, 0, 0.0]])
-    cone = friction_cone("frictionless")
+    cone = jd.contact.friction_cone("frictionless")
     G = grasp(points, normals, "frictionless")
-    assert not force_closure_of_map(G[:, :6], [cone] * 6).closed
-    computed = force_closure_of_map(G, [cone] * 7)
+    assert not jd.contact.force_closure_of_map(G[:, :6], [cone] * 6).closed
+    computed = jd.contact.force_closure_of_map(G, [cone] * 7)
     assert computed.closed == by_edges(G, np.ones((1, 1)))
 
 
 def test_planar_grasps():
     # Wrenches (fx, fy, tz) of two fingers with friction that oppose each other along x.
     G = np.array([[0, 1, 0, -1], [1, 0, -1, 0], [-0.1, 0, -0.1, 0]])
-    cone = friction_cone("hard-finger", 0.4, in_plane=True)
-    computed = force_closure_of_map(G, [cone] * 2)
+    cone = jd.contact.friction_cone("hard-finger", 0.4, in_plane=True)
+    computed = jd.contact.force_closure_of_map(G, [cone] * 2)
     assert computed.closed
     np.testing.assert_allclose(computed.margin, 0.2, atol=1e-9)
-    assert not force_closure_of_map(np.abs(G), [cone] * 2).closed
+    assert not jd.contact.force_closure_of_map(np.abs(G), [cone] * 2).closed
 
 
 def agree(count, seed):
     closed = disputed = 0
     for points, normals in random_grasps(count, seed):
         G = grasp(points, normals, "hard-finger")
-        pyramid = force_closure_of_map(G, [HARD] * 3, faces=8)
+        pyramid = jd.contact.force_closure_of_map(G, [HARD] * 3, faces=8)
         disputed += pyramid.closed != by_edges(G, edges(HARD, 8, 0.5))
-        exact = force_closure_of_map(G, [HARD] * 3)
+        exact = jd.contact.force_closure_of_map(G, [HARD] * 3)
         # The round cone is between the pyramids within it and around it.
         assert pyramid.margin <= exact.margin + 1e-8
         if exact.closed:
@@ -159,30 +159,35 @@ def test_random_grasps_agree_with_the_program_over_edges(count, seed):
 
 def test_cuts_that_do_not_reach_the_margin_are_no_answer(monkeypatch):
     """One round of tangent planes bounds the margin from above alone."""
-    cone = friction_cone("hard-finger", mu=2.0)
+    cone = jd.contact.friction_cone("hard-finger", mu=2.0)
     G = np.random.default_rng(3).normal(size=(6, 18))
-    assert force_closure_of_map(G, [cone] * 6).margin > 1e-3
+    assert jd.contact.force_closure_of_map(G, [cone] * 6).margin > 1e-3
     monkeypatch.setattr("jaxdyn.contact.forces._ROUNDS", 1)
     with pytest.raises(RuntimeError, match="the margin was not found to 1e-09 with 1 rounds"):
-        force_closure_of_map(G, [cone] * 6)
+        jd.contact.force_closure_of_map(G, [cone] * 6)
 
 
 def test_units_of_length_do_not_matter():
     G = grasp(*three(), "hard-finger")
     millimetres = G * np.array([1, 1, 1, 1e3, 1e3, 1e3])[:, None]
     np.testing.assert_allclose(
-        force_closure_of_map(millimetres, [HARD] * 3).margin, force_closure_of_map(G, [HARD] * 3).margin, atol=1e-9
+        jd.contact.force_closure_of_map(millimetres, [HARD] * 3).margin,
+        jd.contact.force_closure_of_map(G, [HARD] * 3).margin,
+        atol=1e-9,
     )
 
 
 BAD = [
-    (lambda G: force_closure_of_map(G, [HARD] * 2), "G has 9 columns"),
-    (lambda G: force_closure_of_map(G, 3), "cones is a int"),
-    (lambda G: force_closure_of_map(G, [HARD] * 3, side="left"), "side is 'left'"),
-    (lambda G: force_closure_of_map(G, [HARD] * 3, faces=2), "faces is 2"),
-    (lambda G: force_closure_of_map(G[0], [HARD] * 3), "G has shape"),
-    (lambda G: force_closure_of_map(np.full_like(G, np.nan), [HARD] * 3), "not a number"),
-    (lambda G: jax.jit(lambda G: jnp.ones(()) * force_closure_of_map(G, [HARD] * 3).margin)(G), "outside of jit"),
+    (lambda G: jd.contact.force_closure_of_map(G, [HARD] * 2), "G has 9 columns"),
+    (lambda G: jd.contact.force_closure_of_map(G, 3), "cones is a int"),
+    (lambda G: jd.contact.force_closure_of_map(G, [HARD] * 3, side="left"), "side is 'left'"),
+    (lambda G: jd.contact.force_closure_of_map(G, [HARD] * 3, faces=2), "faces is 2"),
+    (lambda G: jd.contact.force_closure_of_map(G[0], [HARD] * 3), "G has shape"),
+    (lambda G: jd.contact.force_closure_of_map(np.full_like(G, np.nan), [HARD] * 3), "not a number"),
+    (
+        lambda G: jax.jit(lambda G: jnp.ones(()) * jd.contact.force_closure_of_map(G, [HARD] * 3).margin)(G),
+        "outside of jit",
+    ),
 ]
 
 

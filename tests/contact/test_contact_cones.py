@@ -7,7 +7,7 @@ import pytest
 from pinocchio_bridge import quick
 from scipy.optimize import linprog
 
-from jaxdyn.contact import friction_cone, surface_cone, wrench_cone, wrench_cone_of_polygon
+import jaxdyn as jd
 
 X, Y, MU = 0.11, 0.05, 0.6
 TRIANGLE = np.array([[0.1, 0.0], [-0.05, 0.06], [-0.07, -0.08]])
@@ -70,7 +70,7 @@ def test_rectangle_has_the_published_rows():
         (-Y, X, -s, -MU, MU, 1),
         (-Y, -X, -s, -MU, -MU, 1),
     ]
-    U = np.asarray(wrench_cone(X, Y, MU))
+    U = np.asarray(jd.contact.wrench_cone(X, Y, MU))
     assert U.shape == (16, 6)
     np.testing.assert_allclose(U, np.array(published), atol=1e-15)
 
@@ -81,18 +81,20 @@ def test_rectangle_is_the_closed_form_of_the_yaw_torque():
     low = -MU * (X + Y) * fz + abs(Y * fx - MU * tx) + abs(X * fy - MU * ty)
     high = MU * (X + Y) * fz - abs(Y * fx + MU * tx) - abs(X * fy + MU * ty)
     bounds = [abs(fx) - MU * fz, abs(fy) - MU * fz, abs(tx) - Y * fz, abs(ty) - X * fz, low - tz, tz - high]
-    np.testing.assert_allclose((wrenches @ np.asarray(wrench_cone(X, Y, MU)).T).max(1), np.max(bounds, 0), atol=1e-14)
+    np.testing.assert_allclose(
+        (wrenches @ np.asarray(jd.contact.wrench_cone(X, Y, MU)).T).max(1), np.max(bounds, 0), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("count, seed", [(400, 2), pytest.param(2000, 3, marks=pytest.mark.slow)])
 def test_rectangle_agrees_with_a_linear_program(count, seed):
-    disputed, inside = agree_with_program(np.asarray(wrench_cone(X, Y, MU)), CORNERS, MU, count, seed)
+    disputed, inside = agree_with_program(np.asarray(jd.contact.wrench_cone(X, Y, MU)), CORNERS, MU, count, seed)
     assert disputed == 0 and count / 8 < inside < 7 * count / 8
 
 
 def test_polygon_of_a_rectangle_is_the_rectangle():
-    rows = np.asarray(wrench_cone_of_polygon(CORNERS, MU))
-    known = np.asarray(wrench_cone(X, Y, MU))
+    rows = np.asarray(jd.contact.wrench_cone_of_polygon(CORNERS, MU))
+    known = np.asarray(jd.contact.wrench_cone(X, Y, MU))
     unit = lambda A: A / np.linalg.norm(A, axis=1, keepdims=True)  # noqa: E731
     assert rows.shape == (16, 6)
     for row in unit(rows):
@@ -100,19 +102,19 @@ def test_polygon_of_a_rectangle_is_the_rectangle():
 
 
 def test_triangle_agrees_with_a_linear_program():
-    U = np.asarray(wrench_cone_of_polygon(TRIANGLE, MU))
+    U = np.asarray(jd.contact.wrench_cone_of_polygon(TRIANGLE, MU))
     disputed, inside = agree_with_program(U, TRIANGLE, MU, 300, 4)
     assert disputed == 0 and 50 < inside < 280
     # Points within the triangle and another order of its corners change nothing.
-    more = np.asarray(wrench_cone_of_polygon([[0.0, 0.0], *TRIANGLE[::-1]], MU))
+    more = np.asarray(jd.contact.wrench_cone_of_polygon([[0.0, 0.0], *TRIANGLE[::-1]], MU))
     assert more.shape == U.shape and max(abs(U - row).max(1).min() for row in more) < 1e-12
 
 
 def test_rectangle_is_differentiable_in_its_sizes():
     wrench = jnp.array([0.1, -0.2, 1.0, 0.01, 0.02, 0.03])
-    jacobian = quick(jax.jacfwd(lambda s: wrench_cone(s[0], s[1], s[2]) @ wrench))(jnp.array([X, Y, MU]))
+    jacobian = quick(jax.jacfwd(lambda s: jd.contact.wrench_cone(s[0], s[1], s[2]) @ wrench))(jnp.array([X, Y, MU]))
     step = 1e-6
-    at = quick(jax.vmap(lambda s: wrench_cone(s[0], s[1], s[2]) @ wrench))
+    at = quick(jax.vmap(lambda s: jd.contact.wrench_cone(s[0], s[1], s[2]) @ wrench))
     sizes = jnp.array([X, Y, MU])[None] + step * jnp.concatenate([jnp.eye(3), -jnp.eye(3)])
     high, low = np.split(np.asarray(at(sizes)), 2)
     np.testing.assert_allclose(jacobian.T, (high - low) / (2 * step), atol=1e-9)
@@ -120,7 +122,7 @@ def test_rectangle_is_differentiable_in_its_sizes():
 
 @pytest.mark.parametrize("kind, gamma", [("hard-finger", None), ("soft-finger", 0.02)])
 def test_cone_and_pyramids_hold_the_inequalities(kind, gamma):
-    cone = friction_cone(kind, MU, gamma)
+    cone = jd.contact.friction_cone(kind, MU, gamma)
     forces = np.random.default_rng(5).normal(size=(4000, cone.size)) * np.array([0.4, 0.4, 1.0, 0.02])[: cone.size]
     slip = MU * forces[:, 2] - np.hypot(forces[:, 0], forces[:, 1])
     least = slip if gamma is None else np.minimum(slip, gamma * forces[:, 2] - abs(forces[:, 3]))
@@ -130,26 +132,26 @@ def test_cone_and_pyramids_hold_the_inequalities(kind, gamma):
         around = (forces @ np.asarray(cone.pyramid(faces, "circumscribed")).T).max(1) <= 0
         assert (least[within] >= 0).all() and around[least >= 0].all()
         # Enlarged by 1 / cos(pi / faces) the inner one contains the cone, so it is the largest with these faces.
-        wide = friction_cone(kind, MU / np.cos(np.pi / faces), gamma)
+        wide = jd.contact.friction_cone(kind, MU / np.cos(np.pi / faces), gamma)
         np.testing.assert_allclose(wide.pyramid(faces, "inscribed"), cone.pyramid(faces, "circumscribed"), atol=1e-14)
     four = np.abs(forces[:, :2]).max(1) - MU * forces[:, 2]
     np.testing.assert_allclose((forces @ np.asarray(cone.pyramid(4, "circumscribed"))[:4].T).max(1), four, atol=1e-14)
 
 
 def test_cones_of_the_other_kinds():
-    assert float(friction_cone("frictionless").margin(jnp.array([2.0]))) == 2.0
-    assert friction_cone("rigid").linear_rows().shape == (0, 6)
-    assert float(friction_cone("rigid").margin(jnp.ones(6))) == np.inf
-    planar = friction_cone("hard-finger", MU, in_plane=True)
+    assert float(jd.contact.friction_cone("frictionless").margin(jnp.array([2.0]))) == 2.0
+    assert jd.contact.friction_cone("rigid").linear_rows().shape == (0, 6)
+    assert float(jd.contact.friction_cone("rigid").margin(jnp.ones(6))) == np.inf
+    planar = jd.contact.friction_cone("hard-finger", MU, in_plane=True)
     np.testing.assert_allclose(planar.margin(jnp.array([-0.5, 1.0])), MU - 0.5, atol=1e-15)
     assert float(planar.normal_force(jnp.array([-0.5, 1.0]))) == 1.0
-    foot = surface_cone(wrench_cone(X, Y, MU))
+    foot = jd.contact.surface_cone(jd.contact.wrench_cone(X, Y, MU))
     wrench = jnp.array([0.1, -0.2, 1.0, 0.01, 0.02, 0.03])
     np.testing.assert_allclose(foot.margin(wrench), -(foot.linear_rows() @ wrench).max(), atol=1e-15)
 
 
 def test_margins_are_smooth_and_on_the_safe_side():
-    cone, smoothing = friction_cone("soft-finger", MU, 0.02), 1e-2
+    cone, smoothing = jd.contact.friction_cone("soft-finger", MU, 0.02), 1e-2
     forces = jnp.array([[0, 0, 0, 0], [0, 0, 1, 0], [0.3, -0.1, 1, 0.005], [1e-160, 0, 1e-9, 0]])
     soft = lambda f: cone.margin(f, smoothing)  # noqa: E731
 
@@ -168,36 +170,36 @@ def test_margins_are_smooth_and_on_the_safe_side():
 
 
 def test_margins_batch_and_keep_the_dtype():
-    cone = friction_cone("hard-finger", jnp.float32(0.5))
+    cone = jd.contact.friction_cone("hard-finger", jnp.float32(0.5))
     forces = jnp.ones((3, 3), jnp.float32)
     computed = jax.jit(jax.vmap(lambda f: cone.margin(f, 1e-3)))(forces)
     assert computed.dtype == jnp.float32 and computed.shape == (3,)
-    slope = jax.grad(lambda mu: friction_cone("hard-finger", mu).margin(jnp.array([0.1, 0.2, 3.0])))(0.5)
+    slope = jax.grad(lambda mu: jd.contact.friction_cone("hard-finger", mu).margin(jnp.array([0.1, 0.2, 3.0])))(0.5)
     np.testing.assert_allclose(slope, 3.0)
 
 
 BAD = [
-    (lambda: friction_cone("sticky"), "sticky"),
-    (lambda: friction_cone("hard-finger", -0.5), r"mu is -0\.5"),
-    (lambda: friction_cone("hard-finger"), "mu is None"),
-    (lambda: friction_cone("hard-finger", 0.5, 0.1), "gamma is 0.1"),
-    (lambda: friction_cone("soft-finger", 0.5, -0.1), "gamma is -0.1"),
-    (lambda: friction_cone("soft-finger", 0.5, 0.1, in_plane=True), "in a plane"),
-    (lambda: friction_cone("frictionless", 0.5), "mu is 0.5"),
-    (lambda: friction_cone("hard-finger", [0.5, 0.5]), "mu has shape"),
-    (lambda: friction_cone("hard-finger", 0.5).margin(jnp.zeros(4)), "force has shape"),
-    (lambda: friction_cone("hard-finger", 0.5).pyramid(2), "faces is 2"),
-    (lambda: friction_cone("hard-finger", 0.5).pyramid(4, "left"), "side is 'left'"),
-    (lambda: surface_cone(jnp.zeros((4, 3))), "rows has shape"),
-    (lambda: surface_cone(jnp.zeros((0, 6))), "at least one row"),
-    (lambda: wrench_cone(-0.1, 0.1, 0.5), "half_x is -0.1"),
-    (lambda: wrench_cone(0.1, 0.0, 0.5), "half_y is 0.0"),
-    (lambda: wrench_cone(0.1, 0.1, -0.5), "mu is -0.5"),
-    (lambda: wrench_cone(0.1, float("nan"), 0.5), "half_y is nan"),
-    (lambda: wrench_cone_of_polygon([[0, 0], [1, 1], [2, 2]], 0.5), "not on a line"),
-    (lambda: wrench_cone_of_polygon([[0, 0], [1, 1]], 0.5), "at least three"),
-    (lambda: wrench_cone_of_polygon(CORNERS, 0.0), "mu is 0.0"),
-    (lambda: jax.jit(lambda c: wrench_cone_of_polygon(c, 0.5))(CORNERS), "outside of jit"),
+    (lambda: jd.contact.friction_cone("sticky"), "sticky"),
+    (lambda: jd.contact.friction_cone("hard-finger", -0.5), r"mu is -0\.5"),
+    (lambda: jd.contact.friction_cone("hard-finger"), "mu is None"),
+    (lambda: jd.contact.friction_cone("hard-finger", 0.5, 0.1), "gamma is 0.1"),
+    (lambda: jd.contact.friction_cone("soft-finger", 0.5, -0.1), "gamma is -0.1"),
+    (lambda: jd.contact.friction_cone("soft-finger", 0.5, 0.1, in_plane=True), "in a plane"),
+    (lambda: jd.contact.friction_cone("frictionless", 0.5), "mu is 0.5"),
+    (lambda: jd.contact.friction_cone("hard-finger", [0.5, 0.5]), "mu has shape"),
+    (lambda: jd.contact.friction_cone("hard-finger", 0.5).margin(jnp.zeros(4)), "force has shape"),
+    (lambda: jd.contact.friction_cone("hard-finger", 0.5).pyramid(2), "faces is 2"),
+    (lambda: jd.contact.friction_cone("hard-finger", 0.5).pyramid(4, "left"), "side is 'left'"),
+    (lambda: jd.contact.surface_cone(jnp.zeros((4, 3))), "rows has shape"),
+    (lambda: jd.contact.surface_cone(jnp.zeros((0, 6))), "at least one row"),
+    (lambda: jd.contact.wrench_cone(-0.1, 0.1, 0.5), "half_x is -0.1"),
+    (lambda: jd.contact.wrench_cone(0.1, 0.0, 0.5), "half_y is 0.0"),
+    (lambda: jd.contact.wrench_cone(0.1, 0.1, -0.5), "mu is -0.5"),
+    (lambda: jd.contact.wrench_cone(0.1, float("nan"), 0.5), "half_y is nan"),
+    (lambda: jd.contact.wrench_cone_of_polygon([[0, 0], [1, 1], [2, 2]], 0.5), "not on a line"),
+    (lambda: jd.contact.wrench_cone_of_polygon([[0, 0], [1, 1]], 0.5), "at least three"),
+    (lambda: jd.contact.wrench_cone_of_polygon(CORNERS, 0.0), "mu is 0.0"),
+    (lambda: jax.jit(lambda c: jd.contact.wrench_cone_of_polygon(c, 0.5))(CORNERS), "outside of jit"),
 ]
 
 

@@ -8,27 +8,24 @@ from pinocchio_bridge import quick
 from scipy.optimize import minimize
 
 import jaxdyn as jd
-from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.contact import friction_cone, optimal_forces
-from jaxdyn.grasp import contact_forces, grasp_map
 
-CONE = friction_cone("hard-finger", 0.8)
+CONE = jd.contact.friction_cone("hard-finger", 0.8)
 WEIGHT = np.array([0, 0, -0.4 * 9.81, 0, 0, 0])
 
 
 def held_ball():
     hand = jd.scenes.hand_with_ball()
     q, _ = jd.scenes.hand_with_ball.start(turned=(0.0, 0.0, 0.0))
-    return hand, quick(lambda q: grasp_map(hand, q))(q)
+    return hand, quick(lambda q: jd.grasp.grasp_map(hand, q))(q)
 
 
 @pytest.mark.long
 def test_optimal_forces_hold_the_ball():
     hand, G = held_ball()
-    computed = quick(lambda G, w: optimal_forces(G, w, [CONE] * 3, preload=0.2))(G, -WEIGHT)
-    assert bool(computed.result == RESULTS.successful)
+    computed = quick(lambda G, w: jd.contact.optimal_forces(G, w, [CONE] * 3, preload=0.2))(G, -WEIGHT)
+    assert bool(computed.result == jd.RESULTS.successful)
     np.testing.assert_allclose(G @ computed.x, -WEIGHT, atol=1e-12)
-    told = contact_forces(hand, computed.x, CONE)
+    told = jd.contact.contact_forces(hand, computed.x, CONE)
     assert list(told.forces) == ["tip1", "tip2", "tip3"]
     # Three equal fingers, each with a third of the weight as friction: mu f_n - w / 3 = 0.2 N at the least force.
     normal = (0.2 + 0.4 * 9.81 / 3) / 0.8
@@ -59,7 +56,9 @@ def test_optimal_forces_are_differentiable_in_friction_and_wrench():
 
     def effort(mu, tilt):
         w = -jnp.asarray(WEIGHT) + tilt * jnp.array([1.0, 0.5, 0, 0.02, 0, 0.01])
-        return jnp.sum(optimal_forces(G, w, [friction_cone("hard-finger", mu)] * 3, preload=0.1).x ** 2)
+        return jnp.sum(
+            jd.contact.optimal_forces(G, w, [jd.contact.friction_cone("hard-finger", mu)] * 3, preload=0.1).x ** 2
+        )
 
     values, slopes = quick(jax.vmap(jax.value_and_grad(effort, (0, 1))))(jnp.array([0.8, 0.5]), jnp.array([0.3, -0.4]))
     step = 1e-5
@@ -75,13 +74,13 @@ def test_optimal_forces_are_differentiable_in_friction_and_wrench():
 def test_a_wrench_that_no_forces_balance_is_told():
     _, G = held_ball()
     G = jnp.where(jnp.arange(9)[None] < 3, G, 0.0)  # one finger alone
-    assert optimal_forces(G, -WEIGHT, [CONE] * 3).result == RESULTS.infeasible
+    assert jd.contact.optimal_forces(G, -WEIGHT, [CONE] * 3).result == jd.RESULTS.infeasible
 
 
 def test_rolling_contacts_have_their_normal_force_in_its_place():
     hand = jd.scenes.hand_rolling_ball()
     lam = jnp.array([3.0, 0.1, 0.2, 2.0, 0.3, 0.4, 1.0, 0.8, 0.6])
-    told = contact_forces(hand, lam, [CONE] * 3)
+    told = jd.contact.contact_forces(hand, lam, [CONE] * 3)
     np.testing.assert_allclose(told.forces["finger2"], [0.3, 0.4, 2.0])
     np.testing.assert_allclose(told.margins["finger2"], 0.8 * 2 - 0.5, atol=1e-15)
     np.testing.assert_allclose(told.margin, 0.8 - 1.0, atol=1e-15)
@@ -91,13 +90,13 @@ def test_bad_input_is_refused():
     hand = jd.scenes.hand_rolling_ball()
     lam = jnp.ones(9)
     for call, match in (
-        (lambda: contact_forces(hand, lam[:8], CONE), "multipliers has shape"),
-        (lambda: contact_forces(hand, lam, [CONE] * 2), "cones has 2 entries"),
-        (lambda: contact_forces(hand, lam, {"thumb": CONE}), "thumb"),
-        (lambda: contact_forces(hand, lam, friction_cone("frictionless")), "components"),
-        (lambda: optimal_forces(jnp.eye(6), jnp.ones(6), [CONE]), "G has 6 columns"),
-        (lambda: optimal_forces(jnp.eye(3), jnp.ones(6), [CONE]), "wrench has shape"),
-        (lambda: optimal_forces(jnp.eye(3), jnp.ones(3), [0.5]), "FrictionCone"),
+        (lambda: jd.contact.contact_forces(hand, lam[:8], CONE), "multipliers has shape"),
+        (lambda: jd.contact.contact_forces(hand, lam, [CONE] * 2), "cones has 2 entries"),
+        (lambda: jd.contact.contact_forces(hand, lam, {"thumb": CONE}), "thumb"),
+        (lambda: jd.contact.contact_forces(hand, lam, jd.contact.friction_cone("frictionless")), "components"),
+        (lambda: jd.contact.optimal_forces(jnp.eye(6), jnp.ones(6), [CONE]), "G has 6 columns"),
+        (lambda: jd.contact.optimal_forces(jnp.eye(3), jnp.ones(6), [CONE]), "wrench has shape"),
+        (lambda: jd.contact.optimal_forces(jnp.eye(3), jnp.ones(3), [0.5]), "FrictionCone"),
     ):
         with pytest.raises(ValueError, match=match):
             call()

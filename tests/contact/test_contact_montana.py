@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 from pinocchio_bridge import quick
 
+import jaxdyn as jd
 from jaxdyn import se3
-from jaxdyn.contact import (
-    Cylinder,
-    Ellipsoid,
-    Parametrised,
-    Plane,
-    Sphere,
-    montana,
-    relative_pose,
-    surface_geometry,
-)
 
 
 def bump(alpha):
@@ -25,15 +16,18 @@ def bump(alpha):
     return jnp.stack([u + 0.2 * v, v, -0.5 * u * u - v * v + 0.3 * u * v])
 
 
-EGG, TIP = Ellipsoid([0.1, 0.2, 0.15]), Ellipsoid([0.03, 0.02, 0.05], poles="x")
+EGG, TIP = jd.contact.Ellipsoid([0.1, 0.2, 0.15]), jd.contact.Ellipsoid([0.03, 0.02, 0.05], poles="x")
 FAST = ("sphere on sphere", "ellipsoid on a parametrised surface")
 PAIRS = {
-    "sphere on sphere": (Sphere(0.1), Sphere(0.02)),
+    "sphere on sphere": (jd.contact.Sphere(0.1), jd.contact.Sphere(0.02)),
     "ellipsoid on ellipsoid": (EGG, TIP),
-    "ellipsoid on plane": (Plane(), TIP),
-    "ellipsoid on cylinder": (Cylinder(0.2), TIP),
-    "ellipsoid on a parametrised surface": (Parametrised(bump), TIP),
-    "ellipsoid in a shallow bowl": (Parametrised(lambda a: jnp.stack([a[0], a[1], a[0] ** 2 + 0.5 * a[1] ** 2])), TIP),
+    "ellipsoid on plane": (jd.contact.Plane(), TIP),
+    "ellipsoid on cylinder": (jd.contact.Cylinder(0.2), TIP),
+    "ellipsoid on a parametrised surface": (jd.contact.Parametrised(bump), TIP),
+    "ellipsoid in a shallow bowl": (
+        jd.contact.Parametrised(lambda a: jnp.stack([a[0], a[1], a[0] ** 2 + 0.5 * a[1] ** 2])),
+        TIP,
+    ),
 }
 ETA = jnp.array([0.3, 0.2, -0.5, 0.4, 0.7])
 
@@ -55,19 +49,19 @@ def sphere_J_c(R, r, eta):
 
 
 # One program for each kind of surface.
-GEOMETRY, KINEMATICS = quick(surface_geometry), quick(montana)
+GEOMETRY, KINEMATICS = quick(jd.contact.surface_geometry), quick(jd.contact.montana)
 
 
 @quick
 def SPHERE(ball, alpha):
-    computed = surface_geometry(ball, alpha)
+    computed = jd.contact.surface_geometry(ball, alpha)
     return computed, ball.coordinates(computed.point)
 
 
 @pytest.mark.parametrize("poles", ["x", "y", "z"])
 def test_sphere_has_its_closed_form(poles):
     R, alpha = 0.3, jnp.array([0.4, -0.9])
-    computed, coordinates = SPHERE(Sphere(R, poles), alpha)
+    computed, coordinates = SPHERE(jd.contact.Sphere(R, poles), alpha)
     np.testing.assert_allclose(computed.metric, np.diag([R, R * np.cos(0.4)]), atol=1e-14)
     np.testing.assert_allclose(computed.curvature, np.eye(2) / R, atol=1e-13)
     np.testing.assert_allclose(computed.torsion, [0, -np.tan(0.4) / R], atol=1e-13)
@@ -79,7 +73,7 @@ def test_sphere_has_its_closed_form(poles):
 
 def test_plane_and_cylinder_have_their_closed_forms():
     alpha = jnp.array([0.4, -0.9])
-    flat, pipe = GEOMETRY(Plane(), alpha), GEOMETRY(Cylinder(0.2), alpha)
+    flat, pipe = GEOMETRY(jd.contact.Plane(), alpha), GEOMETRY(jd.contact.Cylinder(0.2), alpha)
     np.testing.assert_allclose(flat.metric, np.eye(2), atol=1e-15)
     np.testing.assert_allclose(np.r_[flat.curvature.ravel(), flat.torsion], 0, atol=1e-15)
     np.testing.assert_allclose(flat.frame[:, 2], [0, 0, 1], atol=1e-15)
@@ -105,8 +99,8 @@ def test_ellipsoid_has_its_gaussian_and_mean_curvature():
 
 
 def test_flipping_turns_the_normal_and_the_curvature():
-    out = surface_geometry(Parametrised(bump), jnp.array([0.3, 0.2]))
-    back = surface_geometry(Parametrised(bump, flip=True), jnp.array([0.2, 0.3]))
+    out = jd.contact.surface_geometry(jd.contact.Parametrised(bump), jnp.array([0.3, 0.2]))
+    back = jd.contact.surface_geometry(jd.contact.Parametrised(bump, flip=True), jnp.array([0.2, 0.3]))
     np.testing.assert_allclose(back.point, out.point, atol=1e-15)
     np.testing.assert_allclose(back.frame[:, 2], -out.frame[:, 2], atol=1e-15)
     np.testing.assert_allclose(np.trace(back.curvature), -np.trace(out.curvature), atol=1e-12)
@@ -123,7 +117,7 @@ def test_sphere_on_sphere_is_the_closed_form():
 
 
 def test_ball_on_a_plane_rolls_by_its_radius():
-    kinematics = KINEMATICS(Plane(), Sphere(0.1), ETA)
+    kinematics = KINEMATICS(jd.contact.Plane(), jd.contact.Sphere(0.1), ETA)
     np.testing.assert_allclose(np.linalg.norm((kinematics.rolling @ np.array([0.6, -0.8]))[:2]), 0.1, rtol=1e-12)
 
 
@@ -134,9 +128,9 @@ def test_twists_are_those_of_the_relative_pose(name):
 
     @quick
     def both(eta):
-        pose, rates = relative_pose(o, f, eta), jax.jacfwd(lambda e: relative_pose(o, f, e))(eta)
+        pose, rates = jd.contact.relative_pose(o, f, eta), jax.jacfwd(lambda e: jd.contact.relative_pose(o, f, e))(eta)
         twists = jnp.stack([se3.vee(se3.inverse(pose) @ rates[..., i]) for i in range(5)], 1)
-        return montana(o, f, eta), pose, twists
+        return jd.contact.montana(o, f, eta), pose, twists
 
     computed, pose, twists = both(ETA)
     np.testing.assert_allclose(computed.g_of, pose, atol=1e-14)
@@ -154,7 +148,7 @@ def test_rolling_returns_without_slip_and_spin():
     """Contact coordinates integrated by Runge and Kutta: the twist of the poses on the way is the one that was asked for."""
     o, f = PAIRS["ellipsoid on ellipsoid"]
     omega = lambda t: jnp.stack([jnp.cos(t), jnp.sin(2 * t)])  # noqa: E731
-    twist = quick(lambda eta, hat: se3.Ad_inv_apply(montana(o, f, eta).finger.pose, se3.vee(hat)))
+    twist = quick(lambda eta, hat: se3.Ad_inv_apply(jd.contact.montana(o, f, eta).finger.pose, se3.vee(hat)))
 
     @quick
     def path(eta):
@@ -163,12 +157,12 @@ def test_rolling_returns_without_slip_and_spin():
             h = 0.005
 
             def stage(k, part):  # in a loop, which compiles the kinematics once
-                k = montana(o, f, eta + part * h * k).rolling @ omega(t + part * h)
+                k = jd.contact.montana(o, f, eta + part * h * k).rolling @ omega(t + part * h)
                 return k, k
 
             ks = jax.lax.scan(stage, jnp.zeros(5), jnp.array([0.0, 0.5, 0.5, 1.0]))[1]
             new = eta + h / 6 * jnp.array([1.0, 2.0, 2.0, 1.0]) @ ks
-            return (new, t + h), (eta, relative_pose(o, f, eta))
+            return (new, t + h), (eta, jd.contact.relative_pose(o, f, eta))
 
         return jax.lax.scan(step, (eta, jnp.zeros(())), None, length=80)[1]
 
@@ -183,7 +177,7 @@ def test_rolling_returns_without_slip_and_spin():
 @pytest.mark.long
 def test_batches_compile_and_differentiate_in_the_shape():
     def size(axes, eta):
-        return jnp.sum(montana(Ellipsoid(axes), Sphere(0.02), eta).forward ** 2)
+        return jnp.sum(jd.contact.montana(jd.contact.Ellipsoid(axes), jd.contact.Sphere(0.02), eta).forward ** 2)
 
     axes = jnp.array([0.1, 0.2, 0.15])
     etas = jnp.stack([ETA, 0.5 * ETA])
@@ -198,40 +192,50 @@ def test_batches_compile_and_differentiate_in_the_shape():
 
 @pytest.mark.long
 def test_where_a_chart_ends_traced_numbers_are_finite_and_told():
-    ball = Sphere(0.1)
+    ball = jd.contact.Sphere(0.1)
     pole = jnp.array([jnp.pi / 2, 0.0])
-    computed = quick(lambda a: surface_geometry(ball, a))(pole)
+    computed = quick(lambda a: jd.contact.surface_geometry(ball, a))(pole)
     assert not bool(computed.regular)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(computed))
-    flat = quick(lambda e: montana(Plane(), Plane(), e))(ETA)
+    flat = quick(lambda e: jd.contact.montana(jd.contact.Plane(), jd.contact.Plane(), e))(ETA)
     assert not bool(flat.strict) and np.isfinite(flat.forward).all()
-    assert float(ball.chart_margin(pole)) < 1e-12 and float(Plane().chart_margin(pole)) == np.inf
+    assert float(ball.chart_margin(pole)) < 1e-12 and float(jd.contact.Plane().chart_margin(pole)) == np.inf
     # The same point in another chart is regular.
-    other = Sphere(0.1, poles="x")
-    assert bool(surface_geometry(other, other.coordinates(ball.point(pole))).regular)
+    other = jd.contact.Sphere(0.1, poles="x")
+    assert bool(jd.contact.surface_geometry(other, other.coordinates(ball.point(pole))).regular)
 
 
 @pytest.mark.slow
 def test_float32_stays_float32():
-    kinematics = montana(Sphere(jnp.float32(0.1)), Sphere(jnp.float32(0.02)), ETA.astype(jnp.float32))
+    kinematics = jd.contact.montana(
+        jd.contact.Sphere(jnp.float32(0.1)), jd.contact.Sphere(jnp.float32(0.02)), ETA.astype(jnp.float32)
+    )
     assert kinematics.J_c.dtype == jnp.float32 == kinematics.forward.dtype
     np.testing.assert_allclose(kinematics.J_c, sphere_J_c(0.1, 0.02, np.asarray(ETA)), atol=2e-5)
 
 
 BAD = [
-    (lambda: Sphere(-0.1), "radius is -0.1"),
-    (lambda: Sphere(0.1, poles="w"), "poles is 'w'"),
-    (lambda: Ellipsoid([0.1, 0.0, 0.2]), "semi_axes is"),
-    (lambda: Ellipsoid([0.1, 0.2]), "semi_axes has shape"),
-    (lambda: Cylinder(0.0), "radius is 0.0"),
-    (lambda: surface_geometry(Sphere(0.1), jnp.zeros(3)), "alpha has shape"),
-    (lambda: surface_geometry(Sphere(0.1), jnp.array([np.pi / 2, 0.0])), "chart of the Sphere is singular"),
-    (lambda: surface_geometry("ball", jnp.zeros(2)), "surface is a str"),
-    (lambda: surface_geometry(Parametrised(lambda a: a), jnp.zeros(2)), r"f returned shape \(2,\)"),
-    (lambda: montana(Sphere(0.1), Sphere(0.02), jnp.zeros(4)), "eta has shape"),
-    (lambda: montana(Plane(), Plane(), ETA), "relative curvature"),
+    (lambda: jd.contact.Sphere(-0.1), "radius is -0.1"),
+    (lambda: jd.contact.Sphere(0.1, poles="w"), "poles is 'w'"),
+    (lambda: jd.contact.Ellipsoid([0.1, 0.0, 0.2]), "semi_axes is"),
+    (lambda: jd.contact.Ellipsoid([0.1, 0.2]), "semi_axes has shape"),
+    (lambda: jd.contact.Cylinder(0.0), "radius is 0.0"),
+    (lambda: jd.contact.surface_geometry(jd.contact.Sphere(0.1), jnp.zeros(3)), "alpha has shape"),
     (
-        lambda: montana(Parametrised(lambda a: jnp.stack([*a, 50 * a @ a])), Sphere(0.02), jnp.zeros(5)),
+        lambda: jd.contact.surface_geometry(jd.contact.Sphere(0.1), jnp.array([np.pi / 2, 0.0])),
+        "chart of the Sphere is singular",
+    ),
+    (lambda: jd.contact.surface_geometry("ball", jnp.zeros(2)), "surface is a str"),
+    (
+        lambda: jd.contact.surface_geometry(jd.contact.Parametrised(lambda a: a), jnp.zeros(2)),
+        r"f returned shape \(2,\)",
+    ),
+    (lambda: jd.contact.montana(jd.contact.Sphere(0.1), jd.contact.Sphere(0.02), jnp.zeros(4)), "eta has shape"),
+    (lambda: jd.contact.montana(jd.contact.Plane(), jd.contact.Plane(), ETA), "relative curvature"),
+    (
+        lambda: jd.contact.montana(
+            jd.contact.Parametrised(lambda a: jnp.stack([*a, 50 * a @ a])), jd.contact.Sphere(0.02), jnp.zeros(5)
+        ),
         "relative curvature",
     ),
 ]

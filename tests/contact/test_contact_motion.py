@@ -7,8 +7,6 @@ import pytest
 from scipy.optimize import brentq
 
 import jaxdyn as jd
-from jaxdyn.contact import friction_cone
-from jaxdyn.grasp import contact
 
 MASS, GRAVITY, MU = 2.0, 9.81, 0.5
 TIMES = np.linspace(0.0, 1.0, 6)
@@ -20,8 +18,10 @@ def block(mu=MU):
     """A block in the x-y plane whose centre stands on a point of the table: it can turn, be pulled and be pushed."""
     builder = jd.ModelBuilder("block", gravity=(0.0, -GRAVITY, 0.0))
     builder.add_body("block", None, "planar", jd.inertia.box(MASS, (0.2, 0.1, 0.3)))
-    touch = contact("hard-finger", None, UPRIGHT, object="block", finger_pose=UPRIGHT, in_plane=True, name="table")
-    return jd.Scene(builder.build(), [touch], cones=friction_cone("hard-finger", mu, in_plane=True))
+    touch = jd.grasp.contact(
+        "hard-finger", None, UPRIGHT, object="block", finger_pose=UPRIGHT, in_plane=True, name="table"
+    )
+    return jd.Scene(builder.build(), [touch], cones=jd.contact.friction_cone("hard-finger", mu, in_plane=True))
 
 
 def push(rates):
@@ -35,11 +35,6 @@ def _push(rates, q, v, t):
 
 STILL = (np.zeros(3), np.zeros(3))
 SPIN = (np.zeros(3), np.array([0.0, 0.0, 0.7]))
-
-
-def normal_and_side(rates, t):
-    """Force of the table on the block."""
-    return MASS * GRAVITY - rates[1] * t, -rates[0] * t
 
 
 def motion(mu, rates):
@@ -144,7 +139,7 @@ def test_bad_input_is_refused():
         (lambda: jd.simulate(scene, *STILL, TIMES, contacts="ignore"), "contacts is 'ignore'"),
         (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints), *STILL, TIMES, outputs=WORDS), "has no cones"),
         (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints, cones={"floor": 1}), *STILL, TIMES), "floor"),
-        (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints, cones=friction_cone("hard-finger", 0.2)),
+        (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints, cones=jd.contact.friction_cone("hard-finger", 0.2)),
                              *STILL, TIMES), "3 components, the contact has 2"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=match):

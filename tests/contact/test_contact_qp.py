@@ -7,8 +7,7 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 from scipy.optimize import linprog
 
-from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.contact import solve_qp
+import jaxdyn as jd
 
 N, ROWS, CONES = 6, 9, 2
 MU = 0.6
@@ -36,7 +35,7 @@ def problems(count, seed, *, cones=True, feasible=True):
 
 
 def one(Q, q, G, h, A, b, S, c):
-    return solve_qp(Q, q, G, h, A, b, cones=[(S, c)])
+    return jd.contact.solve_qp(Q, q, G, h, A, b, cones=[(S, c)])
 
 
 many = quick(jax.vmap(one))
@@ -68,7 +67,7 @@ def largest_residual(data, computed):
 def test_conditions_of_optimality_hold():
     data = problems(200, 1)
     computed = many(*data)
-    assert (computed.result == RESULTS.successful).all()
+    assert (computed.result == jd.RESULTS.successful).all()
     # The last Newton steps leave rounding, times lengths of rows of ten and multipliers of a hundred.
     assert largest_residual(data, computed) < 1e-10
     # All kinds of ends occur: cones left alone, on their boundary, at their apex; rows active or not.
@@ -101,7 +100,7 @@ def test_agrees_with_quadprog():
     quadprog = pytest.importorskip("quadprog")
     data = problems(200, 2, cones=False)
     computed = many(*data)
-    assert (computed.result == RESULTS.successful).all()
+    assert (computed.result == jd.RESULTS.successful).all()
     x, multipliers = np.asarray(computed.x), np.asarray(computed.multipliers)
     for i in range(200):
         Q, q, G, h, A, b, _, _ = (part[i] for part in data)
@@ -120,17 +119,17 @@ def test_infeasible_lanes_are_told_and_leave_the_others_alone():
         is_feasible.append(linprog(np.zeros(N), G, h, A[:2], b[:2], bounds=(None, None)).status == 0)
     is_feasible = np.array(is_feasible)
     assert 10 < is_feasible.sum() < 190
-    np.testing.assert_array_equal(computed.result == RESULTS.successful, is_feasible)
-    np.testing.assert_array_equal(computed.result == RESULTS.infeasible, ~is_feasible)
+    np.testing.assert_array_equal(computed.result == jd.RESULTS.successful, is_feasible)
+    np.testing.assert_array_equal(computed.result == jd.RESULTS.infeasible, ~is_feasible)
     assert np.isfinite(computed.x).all()
     # Contradicting equality rows, and a matrix that is not positive definite, in single lanes of a batch.
     Q, q, G, h, A, b, S, c = problems(3, 4)
     Q[1] *= -1
     b[2, 2] += 1.0
     computed = many(Q, q, G, h, A, b, S, c)
-    assert [str(computed.result == code) for code in (RESULTS.successful, RESULTS.indefinite, RESULTS.infeasible)] == [
-        str(np.arange(3) == i) for i in range(3)
-    ]
+    assert [
+        str(computed.result == code) for code in (jd.RESULTS.successful, jd.RESULTS.indefinite, jd.RESULTS.infeasible)
+    ] == [str(np.arange(3) == i) for i in range(3)]
 
 
 @pytest.mark.long
@@ -173,7 +172,7 @@ def test_the_second_derivative_is_that_of_differences():
     S, c = jnp.eye(3)[None] * jnp.array([-1.0, -1.0, -1.0])[None, None], jnp.zeros((1, 3))
 
     def norm(q):
-        return jnp.sum(solve_qp(jnp.diag(jnp.array([1.0, 2.0, 3.0])), q, cones=[(S, c)]).x ** 2)
+        return jnp.sum(jd.contact.solve_qp(jnp.diag(jnp.array([1.0, 2.0, 3.0])), q, cones=[(S, c)]).x ** 2)
 
     hessian = quick(jax.hessian(norm))
     gradient = quick(jax.grad(norm))
@@ -187,7 +186,7 @@ def test_projections_in_closed_form():
     # On a box, on the half-space of a sum, and without any constraint.
     target = jnp.array([2.0, -0.5, 0.3])
     unit = jnp.eye(3)
-    bounded = quick(solve_qp)
+    bounded = quick(jd.contact.solve_qp)
     box = bounded(unit, -target, jnp.concatenate([unit, -unit]), jnp.ones(6))
     np.testing.assert_allclose(box.x, [1, -0.5, 0.3], atol=1e-14)
     np.testing.assert_allclose(box.multipliers, [1, 0, 0, 0, 0, 0], atol=1e-14)
@@ -195,7 +194,7 @@ def test_projections_in_closed_form():
     twice = bounded(unit, -target, jnp.stack([unit[0]] * 6), jnp.array([1.0, 1.0, 1.0, jnp.inf, 5.0, jnp.inf]))
     np.testing.assert_allclose(twice.x, [1, -0.5, 0.3], atol=1e-12)
     np.testing.assert_allclose(twice.multipliers.sum(), 1, atol=1e-12)
-    free = quick(lambda A, b: solve_qp(unit, -target, A=A, b=b))(jnp.ones((2, 3)), jnp.ones(2))
+    free = quick(lambda A, b: jd.contact.solve_qp(unit, -target, A=A, b=b))(jnp.ones((2, 3)), jnp.ones(2))
     np.testing.assert_allclose(free.x, target - (target.sum() - 1) / 3, atol=1e-14)
     np.testing.assert_allclose(free.equality_multipliers, [0.8 / 6] * 2, atol=1e-14)
 
@@ -203,8 +202,8 @@ def test_projections_in_closed_form():
 def test_float32():
     target = jnp.array([2.0, -0.5, 0.3], jnp.float32)
     unit = jnp.eye(3, dtype=jnp.float32)
-    solution = quick(solve_qp)(unit, -target, jnp.concatenate([unit, -unit]), jnp.ones(6, jnp.float32))
-    assert solution.x.dtype == jnp.float32 and bool(solution.result == RESULTS.successful)
+    solution = quick(jd.contact.solve_qp)(unit, -target, jnp.concatenate([unit, -unit]), jnp.ones(6, jnp.float32))
+    assert solution.x.dtype == jnp.float32 and bool(solution.result == jd.RESULTS.successful)
     np.testing.assert_allclose(solution.x, [1, -0.5, 0.3], atol=1e-5)
 
 
@@ -212,11 +211,11 @@ def test_float32():
 def test_too_few_steps_are_told():
     """After one step some are solved by the Newton steps that follow it; the others say that they are not."""
     Q, q, G, h, *_ = problems(40, 9)
-    limited = jax.jit(jax.vmap(lambda *data: solve_qp(*data, max_steps=1)))(Q, q, G, h)
-    whole = jax.jit(jax.vmap(solve_qp))(Q, q, G, h)
-    stalled = np.asarray(limited.result == RESULTS.stalled)
+    limited = jax.jit(jax.vmap(lambda *data: jd.contact.solve_qp(*data, max_steps=1)))(Q, q, G, h)
+    whole = jax.jit(jax.vmap(jd.contact.solve_qp))(Q, q, G, h)
+    stalled = np.asarray(limited.result == jd.RESULTS.stalled)
     assert stalled.any() and (np.asarray(limited.steps) == 1).all()
-    assert (np.asarray(limited.result == RESULTS.successful) == ~stalled).all()
+    assert (np.asarray(limited.result == jd.RESULTS.successful) == ~stalled).all()
     np.testing.assert_allclose(limited.x[~stalled], whole.x[~stalled], atol=1e-8)
 
 
@@ -241,7 +240,7 @@ def test_known_zeros_of_rows_cost_nothing():
         collect(jax.make_jaxpr(function)(*args).jaxpr)
         return sum(sum(program.counts().values()) for program in programs if hasattr(program, "counts"))
 
-    known, given = (lambda Q, q: solve_qp(Q, q, rows, h)), (lambda Q, q, G: solve_qp(Q, q, G, h))
+    known, given = (lambda Q, q: jd.contact.solve_qp(Q, q, rows, h)), (lambda Q, q, G: jd.contact.solve_qp(Q, q, G, h))
     if all_operations := operations(given, Q[0], q[0], rows):
         assert operations(known, Q[0], q[0]) < 0.5 * all_operations
     computed = quick(jax.vmap(known))(Q, q)
@@ -277,10 +276,10 @@ def quadruped(count, seed):
 def test_no_lane_of_ten_thousand_stalls():
     quadprog = pytest.importorskip("quadprog")
     Q, q, G, h, S, c = quadruped(10_000, 6)
-    flat = jax.jit(jax.vmap(lambda *data: solve_qp(*data, tol=1e-9)))(Q, q, G, h)
-    round_ = jax.jit(jax.vmap(lambda Q, q, S, c: solve_qp(Q, q, cones=[(S, c)], tol=1e-9)))(Q, q, S, c)
+    flat = jax.jit(jax.vmap(lambda *data: jd.contact.solve_qp(*data, tol=1e-9)))(Q, q, G, h)
+    round_ = jax.jit(jax.vmap(lambda Q, q, S, c: jd.contact.solve_qp(Q, q, cones=[(S, c)], tol=1e-9)))(Q, q, S, c)
     for computed in (flat, round_):
-        assert (computed.result == RESULTS.successful).all()
+        assert (computed.result == jd.RESULTS.successful).all()
     for i in range(200):
         other = quadprog.solve_qp(np.array(Q[i]), -np.array(q[i]), -np.array(G[i]).T.copy(), -np.array(h[i]), 0)[0]
         np.testing.assert_allclose(flat.x[i], other, atol=1e-8)
@@ -294,7 +293,7 @@ def test_derivatives_of_contact_forces_on_and_off_the_boundary():
     Q, q, _, _, S, c = quadruped(count, 7)
     random = np.random.default_rng(8)
     change = tuple(jnp.asarray(s * random.normal(size=x.shape)) for x, s in ((Q, 0.01), (q, 1.0), (S, 0.03), (c, 1.0)))
-    solve = lambda Q, q, S, c: solve_qp(Q, q, cones=[(S, c)]).x  # noqa: E731
+    solve = lambda Q, q, S, c: jd.contact.solve_qp(Q, q, cones=[(S, c)]).x  # noqa: E731
     forward = jax.jit(jax.vmap(lambda x, d: jax.jvp(solve, x, d)[1]))((Q, q, S, c), change)
     many = jax.jit(jax.vmap(solve))
     at = lambda s: many(*(x + s * d for x, d in zip((Q, q, S, c), change, strict=True)))  # noqa: E731
@@ -327,7 +326,7 @@ BAD = [
 def test_bad_input_is_refused(change, match):
     good = dict(Q=jnp.eye(2), q=jnp.ones(2), G=jnp.ones((1, 2)), h=jnp.ones(1))
     with pytest.raises(ValueError, match=match):
-        solve_qp(**{**good, **change})
+        jd.contact.solve_qp(**{**good, **change})
 
 
 def test_data_that_are_not_finite_have_a_code():
@@ -341,8 +340,8 @@ def test_data_that_are_not_finite_have_a_code():
             changed[i].flat[0] = bad
             rows.append(changed)
     batch = [jnp.stack([row[i] for row in rows]) for i in range(6)]
-    results = jax.jit(jax.vmap(lambda *given: solve_qp(*given).result))(*batch)
-    np.testing.assert_array_equal(np.flatnonzero(results != RESULTS.nonfinite), [0, 8])
+    results = jax.jit(jax.vmap(lambda *given: jd.contact.solve_qp(*given).result))(*batch)
+    np.testing.assert_array_equal(np.flatnonzero(results != jd.RESULTS.nonfinite), [0, 8])
 
 
 def test_projection_on_a_cone_near_its_apex():
@@ -354,7 +353,7 @@ def test_projection_on_a_cone_near_its_apex():
     y = size[:, None] * np.concatenate([-np.ones((300, 1)), u], 1)
 
     def nearest(y):
-        return solve_qp(jnp.eye(3), -y, cones=(-jnp.eye(3)[None], jnp.zeros((1, 3))))
+        return jd.contact.solve_qp(jnp.eye(3), -y, cones=(-jnp.eye(3)[None], jnp.zeros((1, 3))))
 
     found = jax.jit(jax.vmap(nearest))(jnp.asarray(y))
     assert bool(found.success.all())
@@ -375,11 +374,11 @@ def test_derivative_at_a_kink_is_the_mean_of_both_sides():
     inverse = np.linalg.inv(Q)
     for count in (1, 2):
         G = rows[:count]
-        solve = lambda q, G=G: solve_qp(Q, q, G, G @ x).x  # noqa: E731
+        solve = lambda q, G=G: jd.contact.solve_qp(Q, q, G, G @ x).x  # noqa: E731
         held = inverse - inverse @ G.T @ np.linalg.solve(G @ inverse @ G.T, G @ inverse)
         for derivative in (jax.jacfwd, jax.jacrev):
             assert_close(derivative(solve)(jnp.asarray(-Q @ x)), -(inverse + held) / 2, 1e-10)
-    cone = jax.jacrev(lambda y: solve_qp(jnp.eye(3), -y, cones=(-jnp.eye(3)[None], jnp.zeros((1, 3)))).x)
+    cone = jax.jacrev(lambda y: jd.contact.solve_qp(jnp.eye(3), -y, cones=(-jnp.eye(3)[None], jnp.zeros((1, 3)))).x)
     np.testing.assert_allclose(cone(jnp.array([1.0, 0.6, 0.8]))[0, 0], 0.75, rtol=1e-10)
 
 
@@ -387,7 +386,7 @@ def test_derivatives_of_a_program_without_solution_are_nan():
     """Infeasible rows in a batch; the other element keeps its derivative."""
 
     def solve(q):
-        return solve_qp(jnp.eye(1), q[:1], jnp.array([[1.0], [-1.0]]), jnp.stack([q[1], 0.0 * q[1]])).x[0]
+        return jd.contact.solve_qp(jnp.eye(1), q[:1], jnp.array([[1.0], [-1.0]]), jnp.stack([q[1], 0.0 * q[1]])).x[0]
 
     slopes = jax.jit(jax.vmap(jax.grad(solve)))(jnp.array([[-0.5, 1.0], [-0.5, -1.0]]))
     np.testing.assert_allclose(slopes[0], [-1.0, 0.0], atol=1e-10)

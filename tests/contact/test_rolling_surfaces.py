@@ -12,11 +12,9 @@ from test_contact_montana import PAIRS as ALL_PAIRS
 import jaxdyn as jd
 from jaxdyn import scenes, se3
 from jaxdyn.constraints.base import position_residual, rows
-from jaxdyn.contact import Cylinder, Ellipsoid, Parametrised, Plane, Sphere, montana, relative_pose
-from jaxdyn.model import inertia
 
 PAIRS = {name: pair for name, pair in ALL_PAIRS.items() if name != "sphere on sphere"}
-PAIRS["plane on ellipsoid"] = (TIP, Plane())
+PAIRS["plane on ellipsoid"] = (TIP, jd.contact.Plane())
 POSE_A = se3.exp(jnp.array([0.1, -0.2, 0.05, 0.3, 0.2, -0.4]))
 POSE_B = se3.exp(jnp.array([-0.03, 0.02, 0.04, -0.5, 0.1, 0.6]))
 STONE = (0.4, (0.01, -0.02, 0.005), (0.002, 0.003, 0.0025))
@@ -72,9 +70,9 @@ def test_rows_and_rates_are_montanas(name):
 
     @quick
     def setting(eta):
-        kinematics = montana(a, b, eta)
+        kinematics = jd.contact.montana(a, b, eta)
         object_pose = se3.exp(jnp.array([0.3, -0.2, 0.5, 0.2, -0.3, 0.1]))
-        tip_pose = object_pose @ POSE_A @ relative_pose(a, b, eta) @ se3.inverse(POSE_B)
+        tip_pose = object_pose @ POSE_A @ jd.contact.relative_pose(a, b, eta) @ se3.inverse(POSE_B)
         joints = jnp.concatenate([joints_of(object_pose), joints_of(tip_pose)])
         to_tip = POSE_B @ kinematics.finger.pose
         tip_twist = se3.Ad_apply(to_tip, V_c) + se3.Ad_apply(se3.inverse(tip_pose) @ object_pose, TWIST)
@@ -107,9 +105,9 @@ def test_rows_and_rates_are_montanas(name):
 
 
 CLOSED = {
-    "plane": (Plane(), {"on": "plane"}, jnp.array([0.3, -0.2, 0.1])),
-    "sphere": (Sphere(0.3), {"on": "sphere", "surface_radius": 0.3}, 0.4 * jnp.array([0.6, -0.48, 0.64])),
-    "cylinder": (Cylinder(0.3), {"on": "cylinder", "surface_radius": 0.3}, jnp.array([0.24, -0.32, 0.2])),
+    "plane": (jd.contact.Plane(), {"on": "plane"}, jnp.array([0.3, -0.2, 0.1])),
+    "sphere": (jd.contact.Sphere(0.3), {"on": "sphere", "surface_radius": 0.3}, 0.4 * jnp.array([0.6, -0.48, 0.64])),
+    "cylinder": (jd.contact.Cylinder(0.3), {"on": "cylinder", "surface_radius": 0.3}, jnp.array([0.24, -0.32, 0.2])),
 }
 
 
@@ -120,9 +118,9 @@ CLOSED = {
 )
 def test_a_ball_has_the_rows_in_closed_form(on, spin):
     surface, options, center = CLOSED[on]
-    general = one_body(surface, Sphere(0.1), spin=spin)
+    general = one_body(surface, jd.contact.Sphere(0.1), spin=spin)
     closed = jd.Scene(
-        one_body(surface, Sphere(0.1)).system, (jd.rolling_sphere("stone", None, 0.1, spin=spin, **options),)
+        one_body(surface, jd.contact.Sphere(0.1)).system, (jd.rolling_sphere("stone", None, 0.1, spin=spin, **options),)
     )
     joints = jnp.concatenate([center, jnp.array([0.5, -0.5, 0.1, 0.7])])
     q, v = general.system.place(joints), jnp.array([0.2, -0.1, 0.3, 0.5, 0.4, -0.6])
@@ -143,13 +141,13 @@ def test_a_ball_has_the_rows_in_closed_form(on, spin):
 def touching(a, b, eta, V_c, **options):
     """A stone that touches a surface at contact coordinates eta and moves by V_c: scene, q, v."""
     scene = one_body(a, b, **options)
-    q = scene.system.place(joints_of(relative_pose(a, b, eta)), near=eta[None])
-    return scene, q, se3.Ad_apply(montana(a, b, eta).finger.pose, V_c)
+    q = scene.system.place(joints_of(jd.contact.relative_pose(a, b, eta)), near=eta[None])
+    return scene, q, se3.Ad_apply(jd.contact.montana(a, b, eta).finger.pose, V_c)
 
 
 def spatial_mass():
     return np.asarray(
-        inertia.spatial_inertia(jd.ModelBuilder("m").add_body("b", None, "free", STONE).build().inertias[0])
+        jd.inertia.spatial_inertia(jd.ModelBuilder("m").add_body("b", None, "free", STONE).build().inertias[0])
     )
 
 
@@ -161,18 +159,18 @@ def test_sliding_is_lagranges_equations_in_contact_coordinates():
     M, mass, com, fall = spatial_mass(), STONE[0], jnp.asarray(STONE[1]), jnp.asarray(scene.system.gravity)
 
     def metric(eta):
-        J = montana(EGG, TIP, eta).J_F
+        J = jd.contact.montana(EGG, TIP, eta).J_F
         return J.T @ M @ J
 
     def potential(eta):
-        pose = relative_pose(EGG, TIP, eta)
+        pose = jd.contact.relative_pose(EGG, TIP, eta)
         return -mass * fall @ (pose[:3, :3] @ com + pose[:3, 3])
 
     @quick
     def both(q, v, eta):
-        rates = montana(EGG, TIP, eta).forward @ V_c
+        rates = jd.contact.montana(EGG, TIP, eta).forward @ V_c
         eta_rate2 = jd.forward_dynamics(jd.MetricSystem(metric, 5, potential=potential), eta, rates, jnp.zeros(5))
-        J, J_rate = jax.jvp(lambda eta: montana(EGG, TIP, eta).J_F, (eta,), (rates,))
+        J, J_rate = jax.jvp(lambda eta: jd.contact.montana(EGG, TIP, eta).J_F, (eta,), (rates,))
         return jd.constrained_dynamics(scene, q, v).acceleration, J @ eta_rate2 + J_rate @ rates, J @ rates
 
     acceleration, lagrange, twist = both(q, v, ETA)
@@ -185,10 +183,10 @@ def test_rolling_is_newton_eulers_equations_in_the_rates_of_rolling():
     """M V' - ad_V^T M V = G + A^T lam with V = J_F B (wx, wy): two rates and four forces, by one system of equations."""
     w = jnp.array([0.7, -0.4])
     scene, q, v = touching(EGG, TIP, ETA, jnp.array([0.0, 0.0, 0.0, *w, 0.0]), spin=True)
-    M, kinematics = spatial_mass(), montana(EGG, TIP, ETA)
+    M, kinematics = spatial_mass(), jd.contact.montana(EGG, TIP, ETA)
 
     def to_twist(eta):
-        at = montana(EGG, TIP, eta)
+        at = jd.contact.montana(EGG, TIP, eta)
         return at.J_F @ at.rolling
 
     J, J_rate = quick(lambda eta: jax.jvp(to_twist, (eta,), (kinematics.rolling @ w,)))(ETA)
@@ -208,7 +206,7 @@ def test_rolling_is_newton_eulers_equations_in_the_rates_of_rolling():
 @pytest.mark.parametrize(("radius", "ranks"), [(0.1, (2, 3, 5)), (0.3, (2, 2))])
 def test_rolling_reaches_all_contact_coordinates_unless_radii_are_equal(radius, ranks):
     """Murray, Li & Sastry (1994), section 7.4: equal spheres roll as mirror images, which can be integrated."""
-    scene = one_body(Sphere(0.3), Sphere(radius), spin=True)
+    scene = one_body(jd.contact.Sphere(0.3), jd.contact.Sphere(radius), spin=True)
     center = (0.3 + radius) * jnp.array([0.6, -0.48, 0.64])
     q = scene.system.place(jnp.concatenate([center, jnp.array([0.5, -0.5, 0.1, 0.7])]))
     assert jd.reduction.involutive(scene, q).ranks == ranks
@@ -223,7 +221,7 @@ def test_fingertips_that_cannot_reach_the_egg_are_refused():
 @pytest.mark.slow
 def test_assembly_from_far_away_ends_where_the_surfaces_touch():
     """The places are the closest points there, not at the guess, and the displacement is along the gradient of the gap."""
-    scene = one_body(Ellipsoid([0.3, 0.2, 0.25]), Ellipsoid([0.1, 0.2, 0.15], poles="x"))
+    scene = one_body(jd.contact.Ellipsoid([0.3, 0.2, 0.25]), jd.contact.Ellipsoid([0.1, 0.2, 0.15], poles="x"))
     system = scene.system
     guess = system.place(jnp.array([0.5, -0.6, 0.7, 0.8, -0.2, 0.4, 0.4]))
     found = jd.assemble(scene, guess)
@@ -243,9 +241,9 @@ def test_assembly_from_far_away_ends_where_the_surfaces_touch():
 def egg_on_plane(axes):
     """An egg that rolls on a plane, its centre of mass in the middle."""
     builder = jd.ModelBuilder("egg", gravity=(0.0, 0.0, -9.81))
-    builder.add_body("egg", None, "free", inertia.ellipsoid(1.0, (0.3, 0.2, 0.25)))
+    builder.add_body("egg", None, "free", jd.inertia.ellipsoid(1.0, (0.3, 0.2, 0.25)))
     system = jd.contact.RollingModel(
-        builder.build(), [jd.contact.rolling_contact(None, Plane(), "egg", Ellipsoid(axes))]
+        builder.build(), [jd.contact.rolling_contact(None, jd.contact.Plane(), "egg", jd.contact.Ellipsoid(axes))]
     )
     return jd.Scene(system, system.rows)
 
@@ -285,7 +283,9 @@ def test_an_egg_keeps_its_energy_and_both_methods_agree():
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
     # The places are where the surfaces touch, and eta gives the pose back. (The start is the pole, where this chart ends.)
     for row in ends[0][5::5]:
-        pose = relative_pose(Plane(), Ellipsoid(AXES), scene.system.contact_coordinates(row)[0])
+        pose = jd.contact.relative_pose(
+            jd.contact.Plane(), jd.contact.Ellipsoid(AXES), scene.system.contact_coordinates(row)[0]
+        )
         np.testing.assert_allclose(pose, jd.frame_pose(scene.system, row, "egg"), atol=1e-11)
 
 
@@ -334,7 +334,7 @@ def test_a_valley_that_becomes_too_narrow_ends_the_motion():
     def narrowing(a):
         return jnp.stack([a[0], a[1], 0.5 * a[0] ** 2 + 12.0 * a[0] ** 4 + 0.5 * a[1] ** 2])
 
-    scene = one_body(Parametrised(narrowing), Sphere(0.3))
+    scene = one_body(jd.contact.Parametrised(narrowing), jd.contact.Sphere(0.3))
     q = scene.system.place(jnp.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0]), near=[[0.0, 0.0, -0.5, 0.0]])
     v = jnp.array([1.2, 0.0, 0.0, 0.0, 4.0, 0.0])
     for size in (None, 0.005):
@@ -348,27 +348,33 @@ BALL = jnp.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0])
 
 
 def placed_on(f, **options):
-    return one_body(Parametrised(f), Sphere(0.3)).system.place(BALL, **options)
+    return one_body(jd.contact.Parametrised(f), jd.contact.Sphere(0.3)).system.place(BALL, **options)
 
 
 def simulated(change):
-    scene = one_body(Plane(), Sphere(0.3))
+    scene = one_body(jd.contact.Plane(), jd.contact.Sphere(0.3))
     q = change(scene.system)
     return jd.simulate(scene, q, jnp.zeros(6), jnp.array([0.0, 0.1]))
 
 
 BAD = [
-    (lambda: jd.contact.rolling_contact(None, Plane(), "stone", Sphere(-0.1)), "radius is -0.1"),
-    (lambda: jd.contact.rolling_contact(None, "plane", "stone", Sphere(0.1)), "surface is a str"),
+    (lambda: jd.contact.rolling_contact(None, jd.contact.Plane(), "stone", jd.contact.Sphere(-0.1)), "radius is -0.1"),
+    (lambda: jd.contact.rolling_contact(None, "plane", "stone", jd.contact.Sphere(0.1)), "surface is a str"),
     (
-        lambda: jd.contact.rolling_contact(None, Plane(), "ball", Sphere(0.1), slip=True, contact=False),
+        lambda: jd.contact.rolling_contact(
+            None, jd.contact.Plane(), "ball", jd.contact.Sphere(0.1), slip=True, contact=False
+        ),
         "leaves no rows",
     ),
-    (lambda: jd.contact.RollingModel(one_body(Plane(), Sphere(0.3)).system, []), "model is a RollingModel"),
+    (
+        lambda: jd.contact.RollingModel(one_body(jd.contact.Plane(), jd.contact.Sphere(0.3)).system, []),
+        "model is a RollingModel",
+    ),
     (lambda: jd.contact.RollingModel(scenes.sphere_arm().system, ["ball"]), "contacts is"),
     (
         lambda: jd.contact.RollingModel(
-            scenes.sphere_arm().system, [jd.contact.rolling_contact(None, Plane(), "stone", Sphere(0.1))]
+            scenes.sphere_arm().system,
+            [jd.contact.rolling_contact(None, jd.contact.Plane(), "stone", jd.contact.Sphere(0.1))],
         ),
         "frame 'stone' is not in model",
     ),
@@ -376,18 +382,21 @@ BAD = [
     (lambda: placed_on(lambda a: jnp.stack([a[0], a[1], jnp.sqrt(a @ a)]), near=[[0, 0, 0, 0]]), "do not touch in one"),
     (lambda: placed_on(bump), "give near="),
     (lambda: placed_on(bump, near=[0.0, 0.0]), "near has shape"),
-    (lambda: one_body(Plane(), Sphere(0.3)).system.place(BALL[:3]), "joints has shape"),
+    (lambda: one_body(jd.contact.Plane(), jd.contact.Sphere(0.3)).system.place(BALL[:3]), "joints has shape"),
     (lambda: simulated(lambda system: system.place(BALL + 0.05 * jnp.eye(7)[2])), "open by 0.05"),
     (lambda: simulated(lambda system: system.place(BALL).at[7].set(0.5)), "is 0.5 .m or rad. from the closest points"),
     (lambda: simulated(lambda system: BALL), "q0 has shape"),
     (
         lambda: jd.constraint_jacobian(
-            jd.Scene(scenes.sphere_arm().system, one_body(Plane(), Sphere(0.3)).system.rows), jnp.zeros(6)
+            jd.Scene(scenes.sphere_arm().system, one_body(jd.contact.Plane(), jd.contact.Sphere(0.3)).system.rows),
+            jnp.zeros(6),
         ),
         "not in the system",
     ),
     (
-        lambda: jd.join(one_body(Plane(), Sphere(0.3)).system, scenes.sphere_arm().system, prefix=("a", "b")),
+        lambda: jd.join(
+            one_body(jd.contact.Plane(), jd.contact.Sphere(0.3)).system, scenes.sphere_arm().system, prefix=("a", "b")
+        ),
         "is a RollingModel",
     ),
 ]

@@ -292,7 +292,7 @@ def test_warm_start_needs_fewer_iterations():
 @pytest.mark.long
 def test_refusals_and_codes():
     x0, us = jnp.zeros(3), jnp.zeros((4, 2))
-    with pytest.raises(ValueError, match=r"us has shape \(4,\); give controls"):
+    with pytest.raises(ValueError, match=r"us has shape \(4,\)"):
         jd.control.ilqr(linear_step, quadratic, final, x0, us[:, 0])
     with pytest.raises(ValueError, match="iterations is 0"):
         jd.control.ilqr(linear_step, quadratic, final, x0, us, iterations=0)
@@ -300,7 +300,7 @@ def test_refusals_and_codes():
         jd.control.ilqr(linear_step, quadratic, final, x0, us, tol=2.0)
     with pytest.raises(ValueError, match="cost takes"):
         jd.control.ilqr(linear_step, lambda x, u: 0.0, final, x0, us)
-    with pytest.raises(ValueError, match=r"cost returned shape \(3,\); return one number"):
+    with pytest.raises(ValueError, match=r"cost returned shape \(3,\)"):
         jd.control.ilqr(linear_step, lambda x, u, k: x, final, x0, us)
     with pytest.raises(ValueError, match="step returned shapes"):
         jd.control.ilqr(lambda x, u: x[:2], quadratic, final, x0, us)

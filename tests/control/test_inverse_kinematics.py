@@ -157,7 +157,7 @@ def velocity_slots(model, names):
     return np.array([model.topology.q_slices[model.joint_names.index(name)].start for name in names])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_delta_robot_in_a_batch():
     scene, guess = delta()
     rng = np.random.default_rng(0)
@@ -240,7 +240,10 @@ def test_out_of_reach():
 
 
 @pytest.mark.long
-def test_reasons_under_derivatives():
+@pytest.mark.parametrize(
+    "derivative", [jax.grad, *(pytest.param(one, marks=pytest.mark.slow) for one in (jax.jacfwd, jax.hessian))]
+)
+def test_reasons_under_derivatives(derivative):
     """Outside of jit a failing search gives its reason under jax.grad, jacfwd and hessian too."""
     model, four_bar = two_bars(), scenes.four_bar()
     q = scenes.four_bar.start()[0]
@@ -271,10 +274,9 @@ def test_reasons_under_derivatives():
         (lambda x: jd.assemble(four_bar, q, hold={"1": 0.5, "2": x}, guesses=1).q.sum(), "not assembled: jointlock"),
         (by_motors, "motors: they cannot produce"),
     )
-    for i, (search, reason) in enumerate(cases):
-        for derivative in (jax.grad, jax.jacfwd, jax.hessian)[: 3 if i == 0 else 1]:
-            with pytest.raises(ValueError, match=reason):
-                derivative(search)(10.0)
+    for search, reason in cases:
+        with pytest.raises(ValueError, match=reason):
+            derivative(search)(10.0)
 
 
 @pytest.mark.long
@@ -329,17 +331,17 @@ def test_refusals():
     model, q = jd.robots.iiwa(), jnp.full(7, 0.3)
     with pytest.raises(ValueError, match="frame 'hand' is not in model"):
         jd.inverse_kinematics(model, {"hand": np.eye(4)}, q)
-    with pytest.raises(ValueError, match=r"has shape \(2,\); give a pose"):
+    with pytest.raises(ValueError, match=r"has shape \(2,\)"):
         jd.inverse_kinematics(model, {TIP: [0.0, 1.0]}, q)
     with pytest.raises(ValueError, match="its rotation is no rotation matrix"):
         jd.inverse_kinematics(model, {TIP: 2 * np.eye(4)}, q)
-    with pytest.raises(ValueError, match="has the key 'speed'; choose from pose"):
+    with pytest.raises(ValueError, match="has the key 'speed'"):
         jd.inverse_kinematics(model, {TIP: {"speed": [0, 0, 1.0]}}, q)
-    with pytest.raises(ValueError, match=r"direction is \[0. 0. 0.\]; give a vector"):
+    with pytest.raises(ValueError, match=r"direction is \[0. 0. 0.\]"):
         jd.inverse_kinematics(model, {TIP: {"direction": [0.0, 0, 0]}}, q)
     for nothing in ({}, {"axis": [0, 0, 1.0]}):
         for search in (jd.inverse_kinematics, jd.follow):
-            with pytest.raises(ValueError, match=r"names no target; give some of pose"):
+            with pytest.raises(ValueError, match="names no target"):
                 search(model, {TIP: nothing}, q)
     with pytest.raises(ValueError, match=r"axis has shape \(2,\), expected \(3,\)"):
         jd.inverse_kinematics(model, {TIP: {"direction": [0, 0, 1.0], "axis": [0, 1.0]}}, q)
@@ -347,11 +349,11 @@ def test_refusals():
         jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, weights={"hand": 1.0})
     with pytest.raises(ValueError, match=r"weights\['iiwa_link_7'\] has shape \(2,\)"):
         jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, weights={TIP: [1.0, 2.0]})
-    with pytest.raises(ValueError, match=r"weights.* is -1.0; give numbers that are not negative"):
+    with pytest.raises(ValueError, match=r"weights.* is -1\.0"):
         jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, weights={TIP: -1.0})
     with pytest.raises(ValueError, match="guesses is 0"):
         jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, guesses=0)
-    with pytest.raises(ValueError, match="targets is None; give a dictionary"):
+    with pytest.raises(ValueError, match="targets is None"):
         jd.inverse_kinematics(model, None, q)
     with pytest.raises(ValueError, match="has no frames"):
         jd.inverse_kinematics(jd.Scene(scenes.double_pendulum().system), {"x": np.zeros(3)}, jnp.zeros(2))

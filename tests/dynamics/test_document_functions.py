@@ -10,9 +10,6 @@ from pinocchio_bridge import assert_close, make_model, quick, random_states, ran
 from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
-from jaxdyn.dynamics.link_frame import newton_euler_matrices
-from jaxdyn.lie import so3
-from jaxdyn.model.configuration import configuration_rate
 from jaxdyn.model.topology import KINDS
 
 SEQUENCES = ["".join(s) for s in itertools.product("xyz", repeat=3) if s[1] not in (s[0], s[2])]
@@ -31,7 +28,7 @@ def test_newton_euler_with_a_moving_base(fixed):
     """Against inverse dynamics of the same tree on a free body, which has a recursion and kinematics of its own."""
     model, q, v, a, V0, V0_rate = fixed
     free = random_tree_on_free_body(model)
-    m = quick(lambda *x: newton_euler_matrices(x[0], x[1], x[2], base_twist=x[3], base_twist_rate=x[4]))(
+    m = quick(lambda *x: jd.newton_euler_matrices(x[0], x[1], x[2], base_twist=x[3], base_twist_rate=x[4]))(
         model, q, v, V0, V0_rate
     )
     pose = jnp.asarray([0.0, 0, 0, 1, 0, 0, 0])
@@ -60,12 +57,15 @@ def random_tree_on_free_body(model):
 @pytest.mark.usefixtures("as_users_have_it")
 def test_a_base_at_rest_changes_nothing(fixed):
     model, q, v, *_ = fixed
-    at_rest, given = newton_euler_matrices(model, q, v), newton_euler_matrices(model, q, v, base_twist=jnp.zeros(6))
+    at_rest, given = (
+        jd.newton_euler_matrices(model, q, v),
+        jd.newton_euler_matrices(model, q, v, base_twist=jnp.zeros(6)),
+    )
     jax.tree.map(np.testing.assert_array_equal, at_rest, given)
     assert_close(at_rest.bias_force, at_rest.C0 @ v + at_rest.phi, 1e-12)
     assert_close(at_rest.bias_force, jd.bias_force(model, q, v), 1e-12)
     with pytest.raises(ValueError, match=r"base_twist has shape \(3,\), expected \(6,\)"):
-        newton_euler_matrices(model, q, v, base_twist=[0, 0, 1])
+        jd.newton_euler_matrices(model, q, v, base_twist=[0, 0, 1])
 
 
 @pytest.mark.long
@@ -77,7 +77,7 @@ def test_articulated_bodies(armature):
     external = jnp.asarray(np.random.default_rng(4).normal(size=(model.nb, 6)))
     bodies = quick(lambda m, *x: jd.dynamics.articulated_bodies(m, *x[:-1], external=x[-1]))(model, q, v, tau, external)
     a = jd.forward_dynamics(model, q, v, tau, external=external)
-    m = newton_euler_matrices(model, q, v)
+    m = jd.newton_euler_matrices(model, q, v)
     rates = m.G @ (m.xi @ a + m.P0 @ m.V0_dot + m.ad_xi @ m.Gamma @ m.V)
     transmitted = jd.dynamics.joint_wrench(model, q, v, a, external=external)
     got = np.einsum("bij,bj->bi", bodies.inertias, rates.reshape(-1, 6)) + bodies.biases
@@ -135,7 +135,7 @@ def test_centre_of_mass_coordinates_decouple(floating):
     weight = X.T @ np.asarray(jd.gravity_force(model, q))
     assert_close(weight[:3], -float(terms.mass) * np.asarray(model.gravity), 1e-11)
     assert np.abs(weight[3:]).max() < 1e-11
-    rate = configuration_rate(model, q, v)
+    rate = jd.configuration_rate(model, q, v)
     cdot = jax.jvp(lambda q: jd.center_of_mass(model, q), (q,), (rate,))[1]
     nu = T @ v
     assert_close(nu[:3], cdot, 1e-11)
@@ -148,7 +148,7 @@ def test_centre_of_mass_coordinates_decouple(floating):
 
 def test_centre_of_mass_coordinates_have_a_skew_rate_and_ignore_translation(floating):
     model, q, v, _, terms = floating
-    flow = (configuration_rate(model, q, v),)
+    flow = (jd.configuration_rate(model, q, v),)
     rate = jax.jvp(lambda q: jd.dynamics.com_dynamics(model, q, v).mass_matrix, (q,), flow)[1]
     C = terms.coriolis_matrix
     assert_close(C + C.T, rate, 1e-10)
@@ -186,7 +186,7 @@ def test_centre_of_mass_coordinates_of_one_body():
     terms, (m, *_rest) = jd.dynamics.com_dynamics(model, q, v), np.asarray(model.inertias[0])
     spatial = np.asarray(jd.inertia.spatial_inertia(model.inertias[0]))
     c = np.asarray(model.inertias[0, 1:4]) / m
-    hat = np.asarray(so3.hat(jnp.asarray(c)))
+    hat = np.asarray(jd.so3.hat(jnp.asarray(c)))
     inertia = spatial[3:, 3:] + m * hat @ hat
     omega = np.asarray(v[3:])
     assert_close(terms.mass_matrix, inertia, 1e-11)
@@ -195,9 +195,7 @@ def test_centre_of_mass_coordinates_of_one_body():
 
 def test_centre_of_mass_coordinates_refuse_other_trees():
     arm = jd.robots.chain(2)
-    with pytest.raises(
-        ValueError, match=r"com_dynamics: the roots of model .* are .*\(revolute\); give a model with one root"
-    ):
+    with pytest.raises(ValueError, match=r"com_dynamics: the roots of model .* are .*\(revolute\)"):
         jd.dynamics.com_dynamics(arm, jnp.zeros(2), jnp.zeros(2))
     model = random_tree(44, ["free", "revolute"])
     if model.armature is not None:
@@ -210,11 +208,11 @@ def test_centre_of_mass_coordinates_refuse_other_trees():
 def test_euler_rates_of_every_sequence(sequence):
     """Against SciPy's rotation, and against the derivative of the rotation along the rates."""
     angles, rates = jnp.asarray([0.4, 1.1, -0.3]), jnp.asarray([0.5, -0.8, 1.3])
-    R, R_rate = jax.jvp(lambda x: so3.euler_to_matrix(x, sequence), (angles,), (rates,))
+    R, R_rate = jax.jvp(lambda x: jd.so3.euler_to_matrix(x, sequence), (angles,), (rates,))
     assert_close(R, Rotation.from_euler(sequence.upper(), np.asarray(angles)).as_matrix(), 1e-13)
-    E, E_s = so3.euler_body_jacobian(angles, sequence), so3.euler_spatial_jacobian(angles, sequence)
-    assert_close(so3.hat(E @ rates), R.T @ R_rate, 1e-13)
-    assert_close(so3.hat(E_s @ rates), R_rate @ R.T, 1e-13)
+    E, E_s = jd.so3.euler_body_jacobian(angles, sequence), jd.so3.euler_spatial_jacobian(angles, sequence)
+    assert_close(jd.so3.hat(E @ rates), R.T @ R_rate, 1e-13)
+    assert_close(jd.so3.hat(E_s @ rates), R_rate @ R.T, 1e-13)
     assert_close(R @ E, E_s, 1e-13)
 
 
@@ -223,13 +221,13 @@ def test_euler_rates_as_printed():
     """The closed forms of EQUATIONS section 12, for ZYZ, with errata E51 and E52; finite gradients at the pole."""
     phi, theta, psi = angles = jnp.asarray([0.4, 1.1, -0.3])
     (sf, cf), (st, ct), (sp, cp) = ((np.sin(x), np.cos(x)) for x in (phi, theta, psi))
-    E = np.asarray(so3.euler_body_jacobian(angles))
+    E = np.asarray(jd.so3.euler_body_jacobian(angles))
     assert_close(E, [[-st * cp, sp, 0], [st * sp, cp, 0], [ct, 0, 1]], 1e-14)
-    assert_close(so3.euler_spatial_jacobian(angles), [[0, -sf, st * cf], [0, cf, st * sf], [1, 0, ct]], 1e-14)
+    assert_close(jd.so3.euler_spatial_jacobian(angles), [[0, -sf, st * cf], [0, cf, st * sf], [1, 0, ct]], 1e-14)
     assert_close(np.linalg.det(E), -st, 1e-14)
     printed = [[-cp / st, sp, cp * ct / st], [sp / st, cp, -sp * ct / st], [0, 0, 1]]
     assert_close(np.linalg.inv(E).T, printed, 1e-13)
-    assert np.isfinite(jax.jacrev(jax.jacfwd(so3.euler_body_jacobian))(jnp.zeros(3))).all()
+    assert np.isfinite(jax.jacrev(jax.jacfwd(jd.so3.euler_body_jacobian))(jnp.zeros(3))).all()
     for wrong in ("zzy", "xy", "abc"):
         with pytest.raises(ValueError, match="sequence is"):
-            so3.euler_to_matrix(angles, wrong)
+            jd.so3.euler_to_matrix(angles, wrong)

@@ -24,8 +24,6 @@ from jaxdyn import se3
 from jaxdyn.dynamics import centroidal, kinematics
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics import world_frame as matrix_form
-from jaxdyn.model.configuration import configuration_rate, neutral
-from jaxdyn.model.inertia import transform_inertia
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 TREES = {
@@ -159,7 +157,7 @@ def test_identities_along_the_motion(name):
     @quick
     @functools.partial(jax.vmap, in_axes=(None, 0, 0, 0, 0, 0, 0))
     def rates(model, q, v, a, tau, tau_inside, external):
-        qdot = configuration_rate(model, q, v)
+        qdot = jd.configuration_rate(model, q, v)
 
         def along(function):
             return jax.jvp(function, (q,), (qdot,))[1]
@@ -300,7 +298,7 @@ def _in_other_frames(model, seed):
     return model.replace(
         home=jnp.asarray(outer @ np.asarray(model.home) @ transforms),
         screws=quick(jax.vmap(se3.Ad_inv_apply))(jnp.asarray(transforms), model.screws),
-        inertias=quick(jax.vmap(transform_inertia))(jnp.asarray(back), model.inertias),
+        inertias=quick(jax.vmap(jd.inertia.transform_inertia))(jnp.asarray(back), model.inertias),
         frame_poses=jnp.asarray(back[own] @ np.asarray(model.frame_poses)),
     ), transforms
 
@@ -452,7 +450,7 @@ def test_derivatives_are_finite_at_rest_and_without_mass(kinds):
     model = random_tree(72, list(kinds), parents=[-1, 0, 1])
     model = model.replace(inertias=model.inertias.at[1].set(0.0))
     leaves = {name: getattr(model, name) for name in LEAVES}
-    q, zero = neutral(model), jnp.zeros(model.nv)
+    q, zero = jd.neutral(model), jnp.zeros(model.nv)
 
     def total(args):
         return jnp.sum(jnp.sin(_flat(model, *args)))

@@ -7,15 +7,9 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree
 
+import jaxdyn as jd
 from jaxdyn import inertia, scenes
-from jaxdyn.constraints import Holonomic
-from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
 from jaxdyn.dynamics import recursions, scans, world_frame
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import Model
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import ExplicitSystem
 
 FORMS = {"matrices": world_frame.forward_dynamics, "recursion": recursions.aba, "loops": scans.forward_dynamics}
 
@@ -36,7 +30,7 @@ def arm():
     return model.replace(armature=None), q, v, tau
 
 
-def scaled(model: Model, length: float, mass: float, gravity: float) -> Model:
+def scaled(model: jd.Model, length: float, mass: float, gravity: float) -> jd.Model:
     """The same mechanism in other units, or a larger or heavier twin."""
     prismatic = np.array([kind == "prismatic" for kind in model.topology.kinds])
     inertias = model.inertias * (mass * np.array([1.0] + 3 * [length] + 6 * [length**2]))[None]
@@ -87,7 +81,7 @@ def test_a_million_turns_cost_the_digits_of_the_angle(arm):
 
 def two_links(ratio):
     """Two point masses 1 and `ratio` kg on rods of 1 m, q relative, and the exact acceleration at a state."""
-    builder = ModelBuilder("two links", gravity=(0.0, -9.81, 0.0))
+    builder = jd.ModelBuilder("two links", gravity=(0.0, -9.81, 0.0))
     point = (1.0, 0.0, 0.0)
     builder.add_body("a", joint="revolute", axis=(0, 0, 1), inertia=inertia.point_mass(1.0, point))
     builder.add_body("b", "a", joint="revolute", axis=(0, 0, 1), pose=point, inertia=inertia.point_mass(ratio, point))
@@ -117,12 +111,12 @@ def test_a_heavy_or_nearly_massless_tip(ratio):
 @pytest.mark.parametrize("angle", [1e-2, 1e-4, 1e-6, 1e-8, 1e-12])
 def test_rows_that_nearly_depend_on_each_other(angle):
     """A particle held by two lines at a small angle: at rest while they count as two, and said to be on one below that."""
-    system = ExplicitSystem(lambda q: jnp.eye(2), lambda q, v: jnp.zeros(2), 2)
+    system = jd.ExplicitSystem(lambda q: jnp.eye(2), lambda q, v: jnp.zeros(2), 2)
     lines = jnp.asarray([[0.0, 1.0], [np.sin(angle), np.cos(angle)]])
-    scene = Scene(system, (Holonomic(jax.tree_util.Partial(lambda lines, q, t: lines @ q, lines), name="lines"),))
+    scene = jd.Scene(system, (jd.Holonomic(jax.tree_util.Partial(lambda lines, q, t: lines @ q, lines), name="lines"),))
     push = jnp.asarray([1.0, 2.0])
-    dynamics = constrained_dynamics(scene, jnp.zeros(2), jnp.zeros(2), push)
-    assert dynamics.result == RESULTS.successful
+    dynamics = jd.constrained_dynamics(scene, jnp.zeros(2), jnp.zeros(2), push)
+    assert dynamics.result == jd.RESULTS.successful
     if angle > 1e-8:
         assert int(dynamics.rank) == 2
         assert jnp.abs(dynamics.acceleration).max() < 1e-14 / angle  # the crossing is known to eps / angle
@@ -140,7 +134,7 @@ def test_a_start_off_the_constraint(violation):
     q = q * (1 + violation)
     if violation > 1e-6:
         with pytest.raises(ValueError, match=r"not on the constraints: .* open by"):
-            simulate(scene, q, v, jnp.asarray([0.0, 0.1]))
+            jd.simulate(scene, q, v, jnp.asarray([0.0, 0.1]))
     else:
-        solution = simulate(scene, q, v, jnp.asarray([0.0, 0.1]), outputs=("constraint_residual",))
+        solution = jd.simulate(scene, q, v, jnp.asarray([0.0, 0.1]), outputs=("constraint_residual",))
         assert solution.constraint_residual[-1].max() < 1e-14

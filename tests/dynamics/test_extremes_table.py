@@ -7,13 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxdyn as jd
 from benchmarks import extremes
 from benchmarks.extreme_motions import SOLVERS, run_oscillator, stability_limits
 from jaxdyn import robots, scenes
 from jaxdyn.constraints.codes import code_of
 from jaxdyn.reports import references
-from jaxdyn.simulation.options import Steps
-from jaxdyn.simulation.run import simulate
 
 CASES = extremes.load()
 BOTH, ONE = ("float64", "float32"), ("float64",)
@@ -84,7 +83,7 @@ def test_too_many_turns_are_refused_by_name():
     with pytest.raises(
         ValueError, match=r"q0 is 6283.19 rad at index 1, which float32 holds only to .* the 1000 whole turns"
     ):
-        simulate(model, [0.0, 2000 * np.pi], [0.0, 0.0], [0.0, 1.0])
+        jd.simulate(model, [0.0, 2000 * np.pi], [0.0, 0.0], [0.0, 1.0])
 
 
 SLOW = {
@@ -145,7 +144,7 @@ def test_a_small_loop_that_is_open_is_refused():
     scene = extremes.as_dtype(scenes.four_bar(lengths=lengths, gravity=gravity), jnp.float32)
     q, v = (x.astype(jnp.float32) for x in scenes.four_bar.start())
     ts = jnp.asarray([0.0, 0.1], jnp.float32)
-    run = extremes.quick(jax.vmap(lambda off: code_of(simulate(scene, q.at[1].add(off), v, ts).result)))
+    run = extremes.quick(jax.vmap(lambda off: code_of(jd.simulate(scene, q.at[1].add(off), v, ts).result)))
     codes = [extremes.name_of(code) for code in run(jnp.asarray([0.0, 0.2], jnp.float32))]
     assert codes == ["successful", "inconsistent_start"]
 
@@ -166,8 +165,8 @@ def test_motion_passes_singular_positions_at_any_tolerance():
 
     @jax.vmap
     def run(tolerance):
-        computed = simulate(
-            scene, q, v, ts, stepsize=Steps(rtol=tolerance, atol=tolerance, max_steps=4096), throw=False
+        computed = jd.simulate(
+            scene, q, v, ts, stepsize=jd.simulation.Steps(rtol=tolerance, atol=tolerance, max_steps=4096), throw=False
         )
         return computed.q, computed.success, computed.stats["num_steps"]
 
@@ -190,8 +189,8 @@ def test_motions_through_many_singular_positions():
     want = references.windows(times, 2).q[place.reshape(256, 6)]
 
     def run(q, v, tolerance):
-        computed = simulate(
-            scene, q, v, ts, stepsize=Steps(rtol=tolerance, atol=tolerance, max_steps=2048), throw=False
+        computed = jd.simulate(
+            scene, q, v, ts, stepsize=jd.simulation.Steps(rtol=tolerance, atol=tolerance, max_steps=2048), throw=False
         )
         return computed.q, computed.success
 

@@ -20,10 +20,9 @@ from pinocchio_bridge import (
 )
 from scipy.linalg import expm
 
+import jaxdyn as jd
 from jaxdyn import se3
-from jaxdyn.compile import compilation
 from jaxdyn.dynamics import frame_motion, kinematics
-from jaxdyn.model.configuration import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 CASES = {
@@ -109,7 +108,7 @@ def test_jacobians_are_derivatives_of_the_pose():
     @quick
     @jax.vmap
     def along(q, v):
-        flow = (configuration_rate(model, q, v),)
+        flow = (jd.configuration_rate(model, q, v),)
         pose, rate = jax.jvp(lambda q: kinematics.frame_pose(model, q, frame), (q,), flow)
         _, jacobian_rate = jax.jvp(lambda q: kinematics.body_jacobian(model, q, frame), (q,), flow)
         inverse = se3.inverse(pose)
@@ -131,7 +130,7 @@ def test_acceleration_is_the_rate_of_the_velocity():
     @quick
     @jax.vmap
     def along(q, v):
-        step = configuration_rate(model, q, v), jnp.cos(v)
+        step = jd.configuration_rate(model, q, v), jnp.cos(v)
         return jax.jvp(lambda q, v: frame_motion.frame_velocity(model, q, v, frames[-1]), (q, v), step)
 
     velocity, rate = along(q, v)
@@ -145,7 +144,7 @@ def test_joints_name_the_frames_of_their_bodies():
     for joint, body in zip(model.joint_names, model.body_names, strict=True):
         assert joint not in model.frame_names
         np.testing.assert_array_equal(kinematics.frame_pose(model, q, joint), kinematics.frame_pose(model, q, body))
-    with pytest.raises(ValueError, match="axes is 'local'; choose from world, body"):
+    with pytest.raises(ValueError, match="axes is 'local'"):
         frame_motion.frame_jacobian(model, q, None, axes="local")
 
 
@@ -172,7 +171,7 @@ def test_product_of_exponentials():
 def test_program_grows_with_the_logarithm_of_depth():
     def operations(n):
         model = random_tree(0, ["revolute"] * n, parents=list(range(-1, n - 1)))
-        with compilation("plain"):
+        with jd.compilation("plain"):
             jaxpr = jax.make_jaxpr(kinematics.forward_kinematics)(model, jnp.zeros(n))
         return str(jaxpr).count("dot_general")
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, load_robot, quick, random_states, random_tree
 
+import jaxdyn as jd
 from jaxdyn.dynamics import kinematics
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics import world_frame as matrix_form
-from jaxdyn.dynamics.link_frame import newton_euler_matrices
-from jaxdyn.model.configuration import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 CASES = {
@@ -31,8 +30,8 @@ def case(name):
     states = random_states(model, 3, 5)[:3]
 
     def values(model, q, v, a):
-        link = newton_euler_matrices(model, q, v, tip=tip)
-        flow = (configuration_rate(model, q, v),)
+        link = jd.newton_euler_matrices(model, q, v, tip=tip)
+        flow = (jd.configuration_rate(model, q, v),)
         world = {
             "mass_matrix": matrix_form.mass_matrix(model, q),
             "mass_matrix_rate": jax.jvp(lambda q: matrix_form.mass_matrix(model, q), (q,), flow)[1],
@@ -136,10 +135,10 @@ def test_refusals():
         with pytest.raises(ValueError, match=r"v = dq/dt .*'j1' \(planar\)"):
             function(model, jnp.zeros(4))
     with pytest.raises(ValueError, match="tip is None"):
-        _ = quick(newton_euler_matrices)(random_tree(1, ["revolute"]), jnp.zeros(1), jnp.zeros(1)).Jt
+        _ = quick(jd.newton_euler_matrices)(random_tree(1, ["revolute"]), jnp.zeros(1), jnp.zeros(1)).Jt
     with pytest.raises(ValueError, match="frame 'none' is not in model"):
-        newton_euler_matrices(model, jnp.zeros(4), jnp.zeros(4), tip="none")
+        jd.newton_euler_matrices(model, jnp.zeros(4), jnp.zeros(4), tip="none")
     arm = load_robot("panda_description/urdf/panda.urdf", lock=("finger",))[1]
     base = next(n for n, b in zip(arm.frame_names, arm.topology.frame_bodies, strict=True) if b < 0)
     with pytest.raises(ValueError, match="fixed to the world"):
-        newton_euler_matrices(arm, jnp.zeros(7), jnp.zeros(7), tip=base)
+        jd.newton_euler_matrices(arm, jnp.zeros(7), jnp.zeros(7), tip=base)

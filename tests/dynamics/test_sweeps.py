@@ -13,7 +13,6 @@ from jaxdyn.compile import kernel
 from jaxdyn.compile.trace import program_of
 from jaxdyn.dynamics import centroidal, kinematics, recursions, scans, tree_frames, world_frame
 from jaxdyn.dynamics.recursions import sweeps
-from jaxdyn.model.robots import random_tree
 
 pytestmark = pytest.mark.native
 
@@ -21,7 +20,7 @@ KINDS = [("revolute",), ("prismatic",), ("helical",), ("revolute", "prismatic", 
 
 
 def tree(kinds, nb=12, branching=1.6, **changes):
-    model = random_tree(3, nb, branching=branching, skew=1.0, taper=0.9, kinds=kinds)
+    model = jd.robots.random_tree(3, nb, branching=branching, skew=1.0, taper=0.9, kinds=kinds)
     # Screws that are not of unit length, and rotors.
     return model.replace(screws=model.screws * 1.3, armature=jnp.linspace(0.1, 0.2, nb), **changes)
 
@@ -70,12 +69,17 @@ def test_as_the_recursions_that_are_written_out(kinds, given):
         assert_close(a, b, 1e-12)
 
 
-@pytest.mark.parametrize("kinds", KINDS)
-@pytest.mark.parametrize("given", [False, True])
-@pytest.mark.parametrize("armature", [False, True])
+@pytest.mark.parametrize(
+    ("armature", "given", "kinds"),
+    [
+        pytest.param(armature, given, kinds, marks=() if armature or kinds == KINDS[0] else pytest.mark.slow)
+        for armature in (False, True)
+        for given in (False, True)
+        for kinds in KINDS
+        if not given or len(kinds) == 1
+    ],
+)
 def test_floating_base(kinds, given, armature):
-    if given and len(kinds) > 1:
-        return
     model = floating(kinds, armature=armature)
     assert sweeps.has_sweeps(model)
     q, v, x = state(model)
@@ -104,7 +108,7 @@ def test_no_sweeps_of_other_trees():
     for name in "ab":
         builder.add_body(name, None, "free", (1.0, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1)))
     assert not sweeps.has_sweeps(builder.build())
-    assert not sweeps.has_sweeps(random_tree(0, 3, kinds=("spherical",)))
+    assert not sweeps.has_sweeps(jd.robots.random_tree(0, 3, kinds=("spherical",)))
 
 
 def test_batches_gravity_and_given_inertias():
@@ -155,7 +159,7 @@ def test_derivatives(kinds, monkeypatch):
 
 def test_code_does_not_grow_with_the_bodies():
     def program(nb):
-        model = random_tree(1, nb, branching=1, skew=0.3, taper=1.0, kinds=("revolute",))
+        model = jd.robots.random_tree(1, nb, branching=1, skew=0.3, taper=1.0, kinds=("revolute",))
         return program_of(sweeps.aba, (), model, state(model))[1][0]
 
     few, many = program(50), program(150)
@@ -168,7 +172,7 @@ def test_code_does_not_grow_with_the_bodies():
 def test_hundreds_of_links(links, branching):
     is_floating = branching == "floating"
     model = floating(("revolute",), links, 1.0, armature=False) if is_floating else None
-    model = model or random_tree(1, links, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
+    model = model or jd.robots.random_tree(1, links, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
     q, v, tau = (0.3 * x for x in state(model))
     a = quick(lambda *s: jd.forward_dynamics(model, *s))(q, v, tau)
     inverse = quick(lambda *s: jd.inverse_dynamics(model, *s))
@@ -179,12 +183,12 @@ def test_hundreds_of_links(links, branching):
 MIXED = ("revolute", "spherical", "prismatic", "planar", "free", "helical")
 
 
-@pytest.mark.parametrize("kinds", [("spherical",), MIXED])
+@pytest.mark.parametrize("kinds", [pytest.param(("spherical",), marks=pytest.mark.slow), MIXED])
 @pytest.mark.parametrize("given", [False, True])
 def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
     """Dynamics in link frames and kinematics as native loops, against products of matrices by JAX."""
     monkeypatch.setattr(tree_frames, "MIN_BODIES_IN_LOOPS", 4)
-    model = random_tree(3, 12, branching=1.6, skew=1.0, taper=0.9, kinds=kinds)
+    model = jd.robots.random_tree(3, 12, branching=1.6, skew=1.0, taper=0.9, kinds=kinds)
     model = model.replace(armature=jnp.linspace(0.1, 0.2, model.nv))
     _, v, x = state(model)
     q, wrenches = jd.random_configuration(model, jax.random.key(0)), jnp.ones((model.nb, 6))
@@ -211,7 +215,7 @@ def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
 )
 def test_many_joints_of_several_kinds(kinds):
     """Public functions of a tree with more bodies than are written out, and their derivatives against differences."""
-    model = random_tree(3, tree_frames.MAX_BODIES + 4, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
+    model = jd.robots.random_tree(3, tree_frames.MAX_BODIES + 4, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
     _, v, x = state(model)
     q = jd.random_configuration(model, jax.random.key(0))
     M, a = quick(lambda q: (jd.mass_matrix(model, q), jd.forward_dynamics(model, q, v, x)))(q)
@@ -239,7 +243,7 @@ def test_code_of_kinematics_does_not_grow_with_the_bodies():
     """Loops of 64 and of 128 bodies have the same operations, and a frame takes the bodies above it alone."""
 
     def count(nb, branching=1):
-        model = random_tree(1, nb, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
+        model = jd.robots.random_tree(1, nb, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
         q = state(model)[0]
         of_all = program_of(kinematics._world_poses.__wrapped__, (), model, (q,))[1][0]
         return [len(x.body.operations) for x in of_all.subprograms]
@@ -251,7 +255,7 @@ def test_code_of_kinematics_does_not_grow_with_the_bodies():
 @pytest.mark.parametrize("kinds", [("revolute",), pytest.param(("revolute", "spherical"), marks=pytest.mark.slow)])
 def test_recursions_by_name_of_many_bodies(kinds):
     """`rnea`, `aba` and `crba` of many bodies are the loops of the public quantities, with wrenches and without accelerations."""
-    model = random_tree(3, tree_frames.MAX_BODIES + 2, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
+    model = jd.robots.random_tree(3, tree_frames.MAX_BODIES + 2, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
     _, v, x = state(model)
     q, wrenches = jd.random_configuration(model, jax.random.key(0)), jnp.ones((model.nb, 6))
     computed = quick(
@@ -277,7 +281,9 @@ def test_recursions_by_name_of_many_bodies(kinds):
 @pytest.mark.parametrize("count", [140, pytest.param(420, marks=pytest.mark.slow)])
 def test_mass_matrix_of_a_shallow_tree(count):
     """Of many bodies and few pairs, written out and beyond by loops, and within another kernel: forces of unit accelerations."""
-    model = random_tree(3, count, branching=20, skew=0.3, taper=1.0, kinds=("revolute",)).replace(gravity=None)
+    model = jd.robots.random_tree(3, count, branching=20, skew=0.3, taper=1.0, kinds=("revolute",)).replace(
+        gravity=None
+    )
     q = state(model)[0]
     places = np.array([0, 7, count // 2, count - 1])
     columns = quick(jax.vmap(lambda e: jd.inverse_dynamics(model, q, jnp.zeros(count), e)))(jnp.eye(count)[places])

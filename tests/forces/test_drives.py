@@ -82,7 +82,7 @@ DRIVES = {
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", DRIVES)
+@pytest.mark.parametrize("kind", [pytest.param("first", marks=pytest.mark.slow), "second"])
 def test_step_response_of_a_drive(kind):
     """Torque, states and motion of a wheel under a constant command, in `simulate` and in `stepper`."""
     scene, command, ts = jd.Scene(wheel(), forces=[DRIVES[kind]]), 2.0, np.linspace(0.0, 0.2, 9)

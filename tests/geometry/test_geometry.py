@@ -318,7 +318,7 @@ def test_bad_immersions_and_metrics_are_refused():
         dynamics.mass_matrix(
             jd.geometry.constrain_by_immersion(jd.MetricSystem(lambda q: jnp.eye(2), 2), sphere, 2), one
         )
-    with pytest.raises(ValueError, match="a scene has 1 constraints; an immersion takes their place"):
+    with pytest.raises(ValueError, match="a scene has 1 constraints"):
         jd.geometry.constrain_by_immersion(jd.Scene(particle, (jd.Holonomic(on_torus),)), torus, 2)
     with pytest.raises(ValueError, match=r"field returned shape \(2, 2\), expected \(3, ...\)"):
         jd.geometry.pull_back(lambda x: jnp.eye(2), torus)(one)
@@ -326,9 +326,9 @@ def test_bad_immersions_and_metrics_are_refused():
         jd.geometry.constrain_by_immersion(particle, torus, 0)
     with pytest.raises(ValueError, match="forces or constraints in s, whose share in q is not known"):
         jd.geometry.reaction_force(jd.Scene(on_sphere, forces=(drag,)), one, one)
-    with pytest.raises(ValueError, match="system is a LagrangianSystem; pass the result of constrain_by_immersion"):
+    with pytest.raises(ValueError, match="system is a LagrangianSystem"):
         jd.geometry.reaction_force(particle, jnp.ones(3), jnp.ones(3))
-    with pytest.raises(ValueError, match="kind is 'third'; choose from first, second"):
+    with pytest.raises(ValueError, match="kind is 'third'"):
         geometry.christoffel_symbols(bumpy, jnp.ones(3), "third")
     with pytest.raises(ValueError, match=r"metric returned shape \(3, 3\), expected \(2, 2\)"):
         geometry.flat(Partial(lambda q: jnp.eye(3)), one, one)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
 from jaxdyn import inertia
-from jaxdyn.grasp import Grasp, contact, hand_dynamics, hand_motions
 
 # Kind of contact and number of joints of each finger, sizes of w and u; "flat" fingers have parallel axes, so that the
 # rows of J_h depend on each other.
@@ -65,9 +64,9 @@ def family(hand):
         body = placed(turn.as_matrix(), q[-7:-4])
         poses = [np.linalg.inv(body) @ np.asarray(tip) for tip in tips(jnp.asarray(q))]
         frames = [placed(Rotation.random(rng=seed + k).as_matrix(), pose[:3, 3]) for k, pose in enumerate(poses)]
-        contacts = [contact(kind, f"tip{i}", frames[i]) for i, kind in enumerate(kinds)]
+        contacts = [jd.grasp.contact(kind, f"tip{i}", frames[i]) for i, kind in enumerate(kinds)]
         nu, tau = jnp.asarray(random.normal(size=sum(sizes))), jnp.asarray(random.normal(size=model.nv))
-        return Grasp(model, "obj", contacts), jnp.asarray(q), nu, tau
+        return jd.grasp.Grasp(model, "obj", contacts), jnp.asarray(q), nu, tau
 
     return made
 
@@ -75,9 +74,9 @@ def family(hand):
 @quick
 def solved(grasp, motions, q, nu, tau):
     """The equations in (w, u), those with multipliers, and the rate of M~ along the motion."""
-    dynamics = hand_dynamics(grasp, q, nu, tau, motions=motions)
+    dynamics = jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions)
     along = (jd.configuration_rate(grasp.system, q, dynamics.velocity),)
-    rate = jax.jvp(lambda q: hand_dynamics(grasp, q, nu, tau, motions=motions).mass_matrix, (q,), along)[1]
+    rate = jax.jvp(lambda q: jd.grasp.hand_dynamics(grasp, q, nu, tau, motions=motions).mass_matrix, (q,), along)[1]
     return {
         "hand": dynamics,
         "rate": rate,
@@ -95,7 +94,7 @@ def test_equations_of_any_hand_are_those_with_multipliers(hand):
     """M~ is the projection of the saddle-point system, on random grasps; lemma 6.1; forces (6.24); energies and powers."""
     for seed in range(20 if hand == "both" else 10):
         grasp, q, nu, tau = family(hand)(seed)
-        motions = hand_motions(grasp, q)
+        motions = jd.grasp.hand_motions(grasp, q)
         assert (motions.object.shape[1], motions.internal.shape[1]) == HANDS[hand][1]
         at = jax.tree.map(np.asarray, solved(grasp, motions, q, nu, tau))
         computed, A, N = at["hand"], at["A"], at["hand"].basis
@@ -127,16 +126,19 @@ def test_a_square_hand_is_its_own_object_dynamics():
     """With J_h square and regular nu is V, and both functions agree."""
     grasp, (q, v) = jd.scenes.hand_with_bar(), jd.scenes.hand_with_bar.start()
     tau = jnp.linspace(-0.3, 0.4, grasp.nv)
-    motions = hand_motions(grasp, q)
+    motions = jd.grasp.hand_motions(grasp, q)
     assert_close(motions.object, np.eye(3), 0)
     assert motions.internal.shape == (4, 0)
     one, other = quick(
-        lambda q: (hand_dynamics(grasp, q, v[4:], tau, motions=motions), jd.grasp.object_dynamics(grasp, q, v[4:], tau))
+        lambda q: (
+            jd.grasp.hand_dynamics(grasp, q, v[4:], tau, motions=motions),
+            jd.grasp.object_dynamics(grasp, q, v[4:], tau),
+        )
     )(q)
     for name in ("mass_matrix", "coriolis_matrix", "gravity_force", "input_map", "acceleration", "contact_forces"):
         assert_close(getattr(one, name), getattr(other, name), 1e-11, name)
     single = jax.tree.map(lambda x: x.astype(jnp.float32), (grasp, q, v[4:], tau, motions))
-    rough = hand_dynamics(*single[:4], motions=single[4])
+    rough = jd.grasp.hand_dynamics(*single[:4], motions=single[4])
     assert rough.acceleration.dtype == jnp.float32
     assert_close(rough.acceleration, one.acceleration, 1e-3)
 
@@ -213,7 +215,7 @@ def test_force_closure_of_a_hand():
     assert computed.closed and computed.margin > 0.1
     np.testing.assert_allclose(jd.grasp.grasp_map(grasp, q) @ computed.forces, 0, atol=1e-9)
     contacts = [one for one in grasp.constraints[:2]]
-    two = Grasp(grasp.system, "ball", contacts, cones=grasp.cones)
+    two = jd.grasp.Grasp(grasp.system, "ball", contacts, cones=grasp.cones)
     with pytest.raises(ValueError, match=r"\['tip1', 'tip2'\] on 'ball' have no force closure: the wrench"):
         jd.grasp.force_closure(two, q, required=True)
     assert not jd.grasp.force_closure(two, q).closed
@@ -224,7 +226,7 @@ def test_manipulability_in_closed_form():
     """The ball's G has the axes sqrt(3), sqrt(3) and sqrt(3/2) r; J_h is a product of three-joint fingers."""
     grasp, q, v, _ = gripped()
     radius, links = 0.1, 0.2
-    motions = hand_motions(grasp, q)
+    motions = jd.grasp.hand_motions(grasp, q)
     measure = lambda q: jd.grasp.manipulability(grasp, q, length=radius, motions=motions)  # noqa: E731
     at = quick(measure)(q)
     # Forces at the equator: G G^T = diag(3, 3, 3, 3/2 r^2, 3/2 r^2, 3 r^2).
@@ -254,7 +256,7 @@ def test_manipulability_in_closed_form():
     slope, both = quick(jax.jacrev(both))(q) @ rate, quick(both)
     h = 1e-5
     assert_close(slope, (both(q + h * rate) - both(q - h * rate)) / (2 * h), 1e-6)
-    with pytest.raises(ValueError, match=r"length is 0\.0; give one positive number"):
+    with pytest.raises(ValueError, match=r"length is 0\.0"):
         jd.grasp.manipulability(grasp, q, length=0.0)
 
 
@@ -268,8 +270,10 @@ def test_manipulability_of_fingers_that_slide():
         builder.add_body(f"y{i}", f"x{i}", "prismatic", inertia.sphere(0.1, 0.02), axis=(0, 1, 0))
     builder.add_body("bar", None, "planar", inertia.rod(0.5, 2.0))
     turn = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]).T
-    contacts = [contact("hard-finger", f"y{i}", placed(turn, [-((-1.0) ** i), 0, 0]), in_plane=True) for i in (1, 2)]
-    grasp = Grasp(builder.build(), "bar", contacts)
+    contacts = [
+        jd.grasp.contact("hard-finger", f"y{i}", placed(turn, [-((-1.0) ** i), 0, 0]), in_plane=True) for i in (1, 2)
+    ]
+    grasp = jd.grasp.Grasp(builder.build(), "bar", contacts)
     at = jd.grasp.manipulability(grasp, jnp.zeros(7))
     assert_close(at.force_axes, np.sqrt([2.0, 2.0, 2.0]), 1e-12)  # G G^T = diag(2, 2, 2 h^2)
     assert_close(at.isotropy, 1.0, 1e-12)
@@ -279,14 +283,14 @@ def test_manipulability_of_fingers_that_slide():
 def test_refusals():
     """What does not fit is refused by name."""
     grasp, q, _, _ = gripped()
-    motions = hand_motions(grasp, q)
+    motions = jd.grasp.hand_motions(grasp, q)
     with pytest.raises(ValueError, match=r"nu has shape \(5,\), expected \(6,\): 6 velocities of the object and 0"):
-        hand_dynamics(grasp, q, jnp.zeros(5), motions=motions)
+        jd.grasp.hand_dynamics(grasp, q, jnp.zeros(5), motions=motions)
     with pytest.raises(ValueError, match=r"motions has rows for 6 velocities .* the grasp has 3 and 4"):
         bar = jd.scenes.hand_with_bar()
-        hand_dynamics(bar, jd.scenes.hand_with_bar.start()[0], jnp.zeros(3), motions=motions)
+        jd.grasp.hand_dynamics(bar, jd.scenes.hand_with_bar.start()[0], jnp.zeros(3), motions=motions)
     with pytest.raises(ValueError, match=r"sizes is \(7, 0\)"):
-        hand_motions(grasp, q, sizes=(7, 0))
+        jd.grasp.hand_motions(grasp, q, sizes=(7, 0))
     with pytest.raises(ValueError, match=r"mu is -0\.5"):
         jd.contact.friction_cone("hard-finger", -0.5)
     with pytest.raises(ValueError, match="preload has shape"):
@@ -299,4 +303,4 @@ def test_refusals():
         jd.grasp.hold(grasp, q, cones={"tip1": jd.contact.friction_cone("hard-finger", 0.5)})
     hollow = jd.ModelBuilder("o").add_body("obj", None, "free", (1.0, (0, 0, 0), (0.1, 0.1, -0.1))).build()
     with pytest.raises(ValueError, match="inertia of the object 'obj' is not positive definite"):
-        Grasp(grasp.system, hollow, [contact("hard-finger", "tip1", None)])
+        jd.grasp.Grasp(grasp.system, hollow, [jd.grasp.contact("hard-finger", "tip1", None)])

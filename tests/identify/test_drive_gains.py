@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from test_identify_robot import arm, motion
 
+import jaxdyn as jd
 from jaxdyn import identify, inertia
 from jaxdyn.cli.identify_tables import gains_text
-from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.model.builder import ModelBuilder
 
 MASS, CENTRE = 0.9, (0.05, 0.02, -0.3)
 MOMENTS = np.diag([0.004, 0.003, 0.002])
@@ -15,7 +14,7 @@ MOMENTS = np.diag([0.004, 0.003, 0.002])
 
 def six():
     """Six joints in changing directions."""
-    builder, parent = ModelBuilder("six"), None
+    builder, parent = jd.ModelBuilder("six"), None
     for i in range(6):
         body = (2.0 - 0.2 * i, (0.02, 0.01, -0.15), (0.02, 0.018, 0.006))
         pose = np.eye(4)
@@ -81,7 +80,7 @@ def test_gains_are_inside_their_intervals_and_mend_the_fit():
 
 def test_a_joint_alone_is_the_linear_fit():
     """One joint: i = W z + h p is linear in z and h, and its least squares are the gain."""
-    builder = ModelBuilder("one")
+    builder = jd.ModelBuilder("one")
     builder.add_body("a", axis=(0, 1, 0), inertia=(1.0, (0.02, 0.01, -0.5), (0.1, 0.09, 0.02)))
     model, gain = builder.build(), np.array([1.3])
     unloaded, loaded = logs_of(model, gain, noise=0.02)
@@ -121,7 +120,7 @@ def test_what_the_payload_does_not_tell_is_said():
     with pytest.raises(ValueError, match=r"not identifiable at any joint|gain of no joint"):
         identify.fit_gains(model, log, log, 1e-9, (0, 0, -0.3), v_s=0.05)
     # A turntable about the vertical feels a payload's inertia alone, which is not known.
-    builder = ModelBuilder("table")
+    builder = jd.ModelBuilder("table")
     builder.add_body("a", axis=(0, 0, 1), inertia=(1.0, (0.1, 0, 0), (0.1, 0.09, 0.02)))
     builder.add_body("b", "a", pose=(0.3, 0, 0), axis=(0, 1, 0), inertia=(0.5, (0, 0, -0.2), (0.02, 0.02, 0.01)))
     table = builder.build()
@@ -149,6 +148,6 @@ def test_weights_that_have_not_settled_are_said(monkeypatch):
             for name, least in limits.items():
                 patch.setattr(f"jaxdyn.identify.payloads.{name}", least)
             short = identify.fit_gains(model, unloaded, loaded, MASS, CENTRE, v_s=0.05)
-        assert short.result is RESULTS.max_steps_reached
+        assert short.result is jd.RESULTS.max_steps_reached
         assert "NOT CONVERGED: max steps reached" in gains_text(short, model.joint_names)
     assert "NOT" not in gains_text(found, model.joint_names)

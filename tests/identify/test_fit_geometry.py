@@ -263,7 +263,7 @@ def test_chosen_places_of_a_loop_close_it_and_repeat_with_their_seed():
 def test_refusals_of_loops():
     scene = four_bar()
     q = np.zeros((9, 3))
-    with pytest.raises(ValueError, match="measured is missing; name the joints"):
+    with pytest.raises(ValueError, match="measured is missing"):
         identify.fit_geometry(scene, q, positions=np.zeros((9, 3)), frame="tip")
     with pytest.raises(ValueError, match="pose 0: the loops stay open"):
         far = four_bar(ground=3.0)
@@ -300,7 +300,9 @@ def test_trial_steps_that_open_the_loops_are_halved():
     np.testing.assert_allclose(fit.predict(q)[:, :3, 3], seen, atol=4e-4)
 
 
-@pytest.mark.parametrize(("position", "turn"), [(1e-3, 0.0), (0.0, 1e-3), (1e-3, 1e-9), (1e-3, 1e-3)])
+@pytest.mark.parametrize(
+    ("position", "turn"), [(1e-3, 0.0), (0.0, 1e-3), pytest.param(1e-3, 1e-9, marks=pytest.mark.slow), (1e-3, 1e-3)]
+)
 def test_deviations_are_right_for_any_ratio_of_the_noises(measured, position, turn):
     model, true, q, _ = measured
     exact, rng, told, found = tips(true, q), np.random.default_rng(0), [], []

@@ -12,10 +12,10 @@ from pinocchio_bridge import to_pinocchio
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, filtfilt
 
+import jaxdyn as jd
 from benchmarks.identify_paths import arm as arm_of_joints
 from benchmarks.identify_paths import fits, recorded
 from jaxdyn import identify, inertia, robots
-from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.condensed_fit import Setting
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, TorqueProblem, robot_chart
@@ -23,11 +23,6 @@ from jaxdyn.identify.methods import Unknowns
 from jaxdyn.identify.problem import errors_of, pose_problem
 from jaxdyn.identify.regression import condense_model
 from jaxdyn.identify.robot_logs import RobotLogs, scene_with_parameters
-from jaxdyn.io import load_model
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.simulation.options import Steps
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.scene import Scene
 
 PI = np.pi
 pseudo_inertias = jax.jit(jax.vmap(inertia.pseudo_inertia))
@@ -42,7 +37,7 @@ def iiwa():
 
 def planar_arm(mass1=1.0, mass2=0.8, dtype=None):
     """Two links about parallel horizontal axes, in the vertical plane."""
-    builder = ModelBuilder("arm", dtype=dtype)
+    builder = jd.ModelBuilder("arm", dtype=dtype)
     moments = np.array([0.1, 0.09, 0.02])
     builder.add_body("a", axis=(0, 1, 0), inertia=(mass1, (0.02, 0.01, -0.5), mass1 * moments))
     builder.add_body("b", "a", pose=(0, 0, -1), axis=(0, 1, 0), inertia=(mass2, (0.01, 0, -0.4), mass2 * moments))
@@ -142,7 +137,7 @@ def test_base_parameters_of_two_links_in_closed_form(arm):
 
 
 def test_free_body_shows_all_ten():
-    builder = ModelBuilder("free")
+    builder = jd.ModelBuilder("free")
     builder.add_body("body", joint="free", inertia=(2.0, (0.1, 0.2, 0.3), (0.3, 0.4, 0.5)))
     base = identify.base_parameters(builder.build())
     assert len(base) == 10 and not base.unidentifiable
@@ -234,9 +229,7 @@ def test_bad_arguments_raise(arm, iiwa_log):
         identify.fit_torques(rod, log)
     with pytest.raises(ValueError, match=r"viscous of coordinate 1 is -0.5 in the model"):
         identify.fit_torques(arm.replace(damping=jnp.array([0.0, -0.5])), log)
-    with pytest.raises(
-        ValueError, match="the log has 1 sample; a motion is replayed from one sample to the next, so log two"
-    ):
+    with pytest.raises(ValueError, match="the log has 1 sample"):
         fit_motion(arm, log[:1])
     with pytest.raises(ValueError, match="horizon=20 steps; a log of 20 samples allows 1 to 19"):
         fit_motion(arm, log, horizon=20)
@@ -331,13 +324,13 @@ def test_interior_points_end_with_a_code_where_numbers_are_not_finite(iiwa, iiwa
     state, targets = iterate.state
     broken = iterate._replace(state=(state._replace(dual=-1e6 * state.dual), targets))
     following, result = method.step(broken, [broken.loss], broken)
-    assert result is RESULTS.nonfinite and following is broken
+    assert result is jd.RESULTS.nonfinite and following is broken
 
 
 def test_feasible_fit_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, iiwa_log):
     """sigma is then its floor, 1e-6 of the torque, and the prior's pull is that small."""
     fit = identify.fit_torques(wrong_iiwa, iiwa_log)
-    assert fit.result == RESULTS.successful
+    assert fit.result == jd.RESULTS.successful
     base = identify.base_parameters(iiwa, identify.TERMS)
     true = identify.nominal_parameters(iiwa)
     true[identify.parameter_names(iiwa).index("iiwa_joint_1.offset") :][:7] = 0.3
@@ -374,7 +367,7 @@ def test_every_iterate_is_feasible(wrong_iiwa, noisy):
     np.testing.assert_array_equal(estimate.history, losses)
     # Its linear algebra runs on one thread, with other rounding.
     np.testing.assert_allclose(fit.history, losses, rtol=1e-10)
-    assert fit.result == RESULTS.successful and len(losses) < 60
+    assert fit.result == jd.RESULTS.successful and len(losses) < 60
 
 
 @pytest.mark.parametrize("prior", [1.0, 10.0])
@@ -384,7 +377,7 @@ def test_the_optimum_of_the_convex_loss_is_one(arm, prior):
     log = identify.Log(log.t, log.q, log.v, log.a, log.tau + 0.3 * log.v + 0.2)
     size = np.sqrt(np.mean(log.tau**2, axis=0))
     fit = identify.fit_torques(arm, log, ("viscous", "offset"), weights=1 / size, prior=prior)
-    scene = Scene(arm, forces=[identify.Friction(jnp.full(2, 0.1), *jnp.zeros((2, 2)), jnp.asarray(0.01))])
+    scene = jd.Scene(arm, forces=[identify.Friction(jnp.full(2, 0.1), *jnp.zeros((2, 2)), jnp.asarray(0.01))])
     tree = identify.Parameters(scene).inertias(weight=prior).positive(lambda s: s.forces[0].viscous)
     tree = tree.free(lambda s: s.forces[0].offset)
     # |w e|^2 / (2 sigma^2) + prior D is N / (2 sigma^2) times the mean of (w e)^2 plus 2 sigma^2 / N times prior D.
@@ -414,7 +407,7 @@ def test_both_fits_of_a_robot_are_one(is_raw):
     # Friction goes through the low-pass of a raw log in both.
     log = identify.from_raw(log.t, log.q, log.tau, cutoff=8.0, every=3) if is_raw else log
     robot, tree = (fit() for fit in fits(model, log))
-    assert type(robot) is type(tree) is identify.Fit and robot.result == tree.result == RESULTS.successful
+    assert type(robot) is type(tree) is identify.Fit and robot.result == tree.result == jd.RESULTS.successful
     base = identify.base_parameters(model, identify.TERMS)
     # The last step of the interior point predicts a decrease of the loss of 1e-6, a thousandth of a standard deviation, at most;
     # it converges quadratically, and Gauss-Newton steps of the tree follow.
@@ -436,7 +429,7 @@ def test_prior_decides_between_data_and_nominal(arm):
     size = np.abs(ways[1]).max() / np.abs(np.asarray(arm.inertias)).max()
     assert 0 < size < 1e-3
     np.testing.assert_allclose(10 * ways[0], ways[1], rtol=0, atol=10 * size * np.abs(ways[1]).max())
-    assert all(fit.result == RESULTS.successful for fit in fits)
+    assert all(fit.result == jd.RESULTS.successful for fit in fits)
 
 
 def test_subsets_of_what_is_fitted(arm):
@@ -475,7 +468,7 @@ def franka(data_dir, robots_dir):
     t, q, _, tau = prepare.raw()
     log = identify.from_raw(t, q, tau)
     path = robots_dir / "panda_description/urdf/panda.urdf"
-    model = load_model(path, lock=("panda_finger_joint1", "panda_finger_joint2"))
+    model = jd.load_model(path, lock=("panda_finger_joint1", "panda_finger_joint2"))
     # The file's damping is the same placeholder in every joint; the protocol's nominal model has no friction.
     return model.replace(damping=None, friction=None), *identify.split(log, 0.7), path
 
@@ -554,7 +547,9 @@ def simulated_log(model, seed=0, noise=0.0):
     phase = jnp.arange(model.nv, dtype=float)[None]
     tau = 2 * jnp.sin((3 + 2 * phase) * t[:, None] + phase)
     start = 0.3 * jnp.ones(model.nv), jnp.zeros(model.nv)
-    motion = simulate(model, *start, t, control=identify.SampledTorque(t, tau), stepsize=Steps(rtol=1e-12, atol=1e-12))
+    motion = jd.simulate(
+        model, *start, t, control=identify.SampledTorque(t, tau), stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12)
+    )
     measured = np.random.default_rng(seed).normal(scale=noise, size=(2, 101, model.nv))
     return identify.Log(t, motion.q + measured[0], motion.v + measured[1], None, tau)
 
@@ -573,7 +568,7 @@ def fit_motion(model, log, shape="full", metric=None, callback=None, solver=None
 @pytest.mark.parametrize("method", ["gauss-newton", "lbfgs"])
 def test_motion_recovers_a_mass_without_noise(method):
     """A pendulum of unknown mass; its bob is a point, no solid body, so its density alone is fitted."""
-    builder = ModelBuilder("pendulum")
+    builder = jd.ModelBuilder("pendulum")
     builder.add_body("bob", axis=(0, 1, 0), inertia=inertia.point_mass(1.0, (0, 0, -0.7)))
     nominal = builder.build()
     true = nominal.replace(inertias=1.8 * nominal.inertias)
@@ -586,13 +581,13 @@ def test_motion_recovers_a_mass_without_noise(method):
     fit = fit_motion(nominal, log, "mass", callback=watch, solver=solver, **options)
     # Tsit5 with 5 ms steps is that exact here.
     np.testing.assert_allclose(fit.system.inertias, true.inertias, rtol=1e-8, atol=1e-12)
-    assert min(masses) > 0 and len(masses) == len(fit.history) and fit.result == RESULTS.successful
+    assert min(masses) > 0 and len(masses) == len(fit.history) and fit.result == jd.RESULTS.successful
     errors = [max(identify.trajectory_error(model, log, **options)) for model in (nominal, fit.system)]
     assert errors[0] > 1 and errors[1] < 1e-6
     # A motion that runs away from the start: the loss is not finite, and the model given comes back.
     broken = identify.Log(log.t, log.q, log.v, None, 1e200 * log.tau)
     fit = fit_motion(nominal, broken, "mass", solver=solver, **options)
-    assert fit.result == RESULTS.nonfinite
+    assert fit.result == jd.RESULTS.nonfinite
     np.testing.assert_allclose(fit.system.inertias, nominal.inertias, rtol=1e-12)
     with pytest.raises(ValueError, match="substeps is 0"):
         identify.rollout(nominal, log, substeps=0)
@@ -619,7 +614,7 @@ def test_motion_with_noisy_states(arm):
     """Free initial states, friction, noisy positions and velocities: within three per cent of the way from the nominal."""
     log = simulated_log(arm, noise=1e-3)
     nominal = planar_arm(1.5, 0.5)
-    scene = Scene(nominal, forces=[identify.Friction(jnp.full(2, 0.1), *jnp.zeros((2, 2)), jnp.asarray(0.01))])
+    scene = jd.Scene(nominal, forces=[identify.Friction(jnp.full(2, 0.1), *jnp.zeros((2, 2)), jnp.asarray(0.01))])
     tree = identify.Parameters(scene).inertias().positive(lambda s: s.forces[0].viscous)
     fit = identify.fit_parameters(scene, log, tree, identify.Objective(horizon=25, initial="free", substeps=2))
     base = identify.base_parameters(arm)

@@ -10,7 +10,6 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.cli import main
 from jaxdyn.constraints.base import position_residual
-from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.linear_fit import fit_mechanism
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.result import Segments, simulate_segment
@@ -50,7 +49,7 @@ def computed(scene, log, parameters, observed):
     return jd.identify.fit_parameters(scene, log, parameters, objective, jd.identify.Solver(tolerance=1e-8, steps=15))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_energy_tells_the_coupler_of_a_four_bar():
     """Its mass by the balance of energy, which constraints do not enter, from the crank alone."""
     q0, v0 = jd.scenes.four_bar.start()
@@ -72,7 +71,7 @@ def test_a_four_bar_by_its_crank_alone():
     tree = jd.identify.Parameters(wrong).inertias(["coupler"], shape="mass", metric=None)
     fit = computed(wrong, log, tree, ["1"])
     np.testing.assert_allclose(fit.system.system.inertias[1, 0], 3.0, rtol=1e-5)
-    assert fit.result == RESULTS.successful and np.isfinite(fit.deviation).all()
+    assert fit.result == jd.RESULTS.successful and np.isfinite(fit.deviation).all()
 
 
 @pytest.mark.slow
@@ -91,7 +90,7 @@ def test_link_lengths_of_a_four_bar_by_two_encoders():
     tree = jd.identify.Parameters(links).positive(lambda links: links.numbers["lengths"])
     fit = computed(links, log, tree, ["1", "3"])
     np.testing.assert_allclose(fit.values, [3.0, 2.5], rtol=1e-5)
-    assert fit.result == RESULTS.successful and (fit.deviation < 1e-3).all()
+    assert fit.result == jd.RESULTS.successful and (fit.deviation < 1e-3).all()
 
 
 @pytest.mark.slow
@@ -199,7 +198,7 @@ def test_measured_joints_that_contradict_the_rows_are_said(monkeypatch):
     np.testing.assert_allclose(state.v, v - n * (n @ v), atol=1e-10)
     monkeypatch.setattr("jaxdyn.identify.mechanisms._ITERATIONS", 1)
     short = on_constraints(scene, q, v, jnp.zeros(()), (0, 1))
-    assert bool(short.result == RESULTS.not_nearest)
+    assert bool(short.result == jd.RESULTS.not_nearest)
     one = Segments(jnp.arange(2.0), jnp.stack([q, q]), jnp.stack([v, v]), jnp.zeros((2, 2)))
     motion, _ = jax.jit(lambda one: simulate_segment(scene, one, None, "linear", {}, observed=(0, 1)))(one)
     assert np.isnan(motion).all()
@@ -276,7 +275,7 @@ def test_base_parameters_of_a_mechanism_from_its_motors(tmp_path, name):
     # The least noise of a fit is a millionth of the torque; directions are weaker than the strongest by up to 600.
     np.testing.assert_allclose(result.values, truth, rtol=1e-8, atol=1e-9)
     assert np.abs(result.nominal - truth).max() > 1e-2
-    assert result.fit.result == RESULTS.successful and len(result.fit.history) < 60
+    assert result.fit.result == jd.RESULTS.successful and len(result.fit.history) < 60
     np.testing.assert_allclose(result.fit.torques(log), log.tau, atol=1e-8)
     # A planar mechanism: of every body the first moments in the plane and one moment of inertia at most.
     assert len(result.base) <= 3 * true.system.nb + 3 * len(motors)
@@ -317,7 +316,7 @@ def test_motors_must_be_as_many_as_degrees_of_freedom(tmp_path):
         )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_identifies_a_mechanism_from_a_log_of_its_motor(tmp_path, capsys):
     true, _ = loaded(tmp_path, "four-bar", (0.9, 1.5)), loaded(tmp_path, "four-bar", (1.1, 1.2))
     t = np.linspace(0, 10, 1001)

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 import pytest
 
+import jaxdyn as jd
 from benchmarks.identify_selection import false_choices
 from benchmarks.identify_selection import motion as random_motion
 from jaxdyn import identify, inertia
 from jaxdyn.cli.identify_tables import payload_text
-from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.condensed_fit import Setting, eliminate, fit_blocks, share_of_extra
 from jaxdyn.identify.logs import filter_like_log, idle_coordinates, samples_for_jumps, travel_ranges
 from jaxdyn.identify.raw_logs import check_log_content, check_rest, motion_band, vibration
@@ -19,12 +19,11 @@ from jaxdyn.identify.robot_logs import RobotLogs, huber_weights
 from jaxdyn.identify.selection import improving_torques, is_clear, log_errors, splits, standard_error
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, is_white, jackknife, model_error_factors
-from jaxdyn.model.builder import ModelBuilder
 
 
 def arm(stretch=0.0, seed=0):
     """Two links that are solid in all directions; `stretch` is the size of a random change of both."""
-    builder = ModelBuilder("arm")
+    builder = jd.ModelBuilder("arm")
     moments = np.array([0.1, 0.09, 0.02])
     builder.add_body("a", axis=(0, 1, 0), inertia=(1.0, (0.02, 0.01, -0.5), moments))
     builder.add_body("b", "a", pose=(0, 0, -1), axis=(0, 1, 0), inertia=(0.8, (0.01, 0, -0.4), 0.8 * moments))
@@ -198,17 +197,17 @@ def test_loads_that_have_not_settled_are_said(truth, monkeypatch):
     given = {"v_s": 0.01, "prior": 1.0, "robust": None}
     terms = (*identify.TERMS, "load")
     fit = identify.fit_robot(model, log(1), terms, **given)
-    assert fit.fit.result is RESULTS.successful
+    assert fit.fit.result is jd.RESULTS.successful
     loaded = truth.copy()
     loaded[10:20] += np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
     held = measured(arm(), motion(3), loaded, noise=0.02, seed=3)
     assert bool(identify.fit_payload(model, log(1), held, robot=fit).success)
     monkeypatch.setattr("jaxdyn.identify.payloads.MOST_ROUNDS", 1)
     short = identify.fit_payload(model, log(1), held, robot=fit)
-    assert short.result is RESULTS.max_steps_reached and "NOT CONVERGED" in payload_text(short)
+    assert short.result is jd.RESULTS.max_steps_reached and "NOT CONVERGED" in payload_text(short)
     basic, extra, where = split_terms(terms, 2)
     problem = RobotLogs(model, (log(1),), basic, extra, "full", 20)
-    for rounds, code in ((3, RESULTS.max_steps_reached), (30, RESULTS.successful)):
+    for rounds, code in ((3, jd.RESULTS.max_steps_reached), (30, jd.RESULTS.successful)):
         assert problem.refine(Setting(0.01, where, 1.0), None, rounds).result is code
 
 
@@ -663,7 +662,7 @@ def test_a_joint_that_hardly_moved_has_no_friction_from_data(truth):
 
 def test_travels_of_joints_with_several_coordinates():
     """A floating body that moves by 0.3 m and turns by 0.1 rad, by its velocity; a slide, by its position."""
-    builder = ModelBuilder("floating")
+    builder = jd.ModelBuilder("floating")
     builder.add_body("base", joint="free", inertia=(1.0, (0, 0, 0), np.ones(3)))
     builder.add_body("slide", "base", joint="prismatic", inertia=(1.0, (0, 0, 0), np.ones(3)))
     model = builder.build()
@@ -759,7 +758,7 @@ def test_payload_is_what_loaded_logs_differ_by(truth):
     assert np.all(np.abs(fit.inertia - held)[seen] <= fit.factor * fit.std[seen] + 1e-3)
     assert np.abs(fit.inertia - held)[seen].max() < 0.03
     assert inertia.is_feasible(fit.inertia)
-    with pytest.raises(ValueError, match=r"body is 'hand'; the bodies are a, b"):
+    with pytest.raises(ValueError, match="body is 'hand'"):
         identify.fit_payload(nominal, unloaded, loaded, "hand")
 
 
@@ -883,6 +882,6 @@ def test_exciting_motion_says_no():
     ):
         with pytest.raises(ValueError, match=words):
             identify.exciting_motion(model, **arguments)
-    lying = ModelBuilder("lying").add_body("a", axis=(0, 1, 0), inertia=(1.0, (0.5, 0, 0), (0.1, 0.1, 0.1))).build()
+    lying = jd.ModelBuilder("lying").add_body("a", axis=(0, 1, 0), inertia=(1.0, (0.5, 0, 0), (0.1, 0.1, 0.1))).build()
     with pytest.raises(ValueError, match="holding the robot at the middle of its ranges needs"):
         identify.exciting_motion(lying, torque=1.0, steps=1)

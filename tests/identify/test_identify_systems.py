@@ -8,18 +8,11 @@ import pytest
 import scipy.stats
 from jax.tree_util import Partial
 
+import jaxdyn as jd
 from jaxdyn import identify, scenes
-from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.forces.elements import JointDamping
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.simulation.options import Steps
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import ExplicitSystem, MetricSystem
 
 G = 9.81
 TRUE = dict(masses=(1.3, 0.7), length=1.1, reaches=(0.45, 0.4), moments=(0.09, 0.03))
@@ -28,8 +21,14 @@ TRUE = dict(masses=(1.3, 0.7), length=1.1, reaches=(0.45, 0.4), moments=(0.09, 0
 def log_of(scene, q0, v0, t, tau, noise=0.0):
     """A motion under known torques, integrated far more finely than the fits do, with its accelerations."""
     control = identify.SampledTorque(t, tau)
-    motion = simulate(
-        scene, q0, v0, t, control=control, stepsize=Steps(rtol=1e-12, atol=1e-12), outputs=("acceleration",)
+    motion = jd.simulate(
+        scene,
+        q0,
+        v0,
+        t,
+        control=control,
+        stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12),
+        outputs=("acceleration",),
     )
     q, v, a = (np.asarray(x) for x in (motion.q, motion.v, motion.acceleration))
     off = noise * np.random.default_rng(1).normal(size=(3, *q.shape))
@@ -92,7 +91,7 @@ def test_parameters_of_a_lagrangian_are_recovered(swung, error, method):
     # Tsit5 with 5 ms steps is that exact here.
     np.testing.assert_allclose(fit.values, WANTED, rtol=1e-8)
     np.testing.assert_allclose(jax.tree.leaves(masses_and_moments(fit.system)), WANTED, rtol=1e-8)
-    assert fit.names == NAMES and fit.result == RESULTS.successful
+    assert fit.names == NAMES and fit.result == jd.RESULTS.successful
     assert min(lowest) > 0 and len(lowest) == len(fit.history)
     assert fit.deviation is None if method == "lbfgs" else np.all(fit.deviation < 1e-6)
     assert (
@@ -130,8 +129,8 @@ LINEAR = {"inertia": 0.8, "stiffness": 5.0, "offset": -0.6, "drive": 0.9}
 
 
 def oscillator(damping=0.3, **changes):
-    system = ExplicitSystem(inertia, driven, 1, parameters=LINEAR | changes)
-    return Scene(system, forces=(JointDamping(damping),))
+    system = jd.ExplicitSystem(inertia, driven, 1, parameters=LINEAR | changes)
+    return jd.Scene(system, forces=(jd.forces.JointDamping(damping),))
 
 
 @pytest.fixture(scope="module")
@@ -225,7 +224,7 @@ def test_trajectories_with_noise_and_free_starts(oscillation):
         objective=identify.Objective(horizon=20, substeps=4),
         positive=everything_but_offset,
     )
-    assert failed.result == RESULTS.nonfinite and np.isnan(failed.deviation).all()
+    assert failed.result == jd.RESULTS.nonfinite and np.isnan(failed.deviation).all()
     np.testing.assert_allclose(failed.values, [0.5, 0.8, 4.0])
     # Noise everywhere, and far more of it where the segments start.
     noise = np.random.default_rng(5).normal(size=(2, *log.q.shape)) * np.where(np.arange(81) % 20, 1e-4, 3e-2)[:, None]
@@ -254,7 +253,7 @@ def test_what_the_log_does_not_determine_is_said(swung):
     q, v, a = np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)
     tau = 1.3 * 0.49 * a + 1.3 * G * 0.7 * np.sin(q) - 0.2
     log = identify.Log(t, *(x[:, None] for x in (q, v, a, tau)))
-    scene = Scene(
+    scene = jd.Scene(
         scenes.pendulum(mass=1.0, length=1.0).system, (), (Partial(lambda c, system, q, v, t: c, jnp.zeros(1)),)
     )
     fit = fit_exactly(scene, log, positive=lambda s: s.system.parameters, free=lambda s: s.forces[0].args)
@@ -269,7 +268,7 @@ def test_what_the_log_does_not_determine_is_said(swung):
         positive=lambda s: s.system.parameters,
         free=lambda s: s.forces[0].args,
     )
-    assert short.result == RESULTS.max_steps_reached and len(short.history) == 3
+    assert short.result == jd.RESULTS.max_steps_reached and len(short.history) == 3
 
 
 @jax.custom_jvp
@@ -292,10 +291,10 @@ def test_steps_that_lower_no_loss_are_no_solution(method):
     q, v, a = np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)
     tau = a + G * np.sin(q) - 0.2 + 0.05 * np.cos(7 * t)
     log = identify.Log(t, *(x[:, None] for x in (q, v, a, tau)))
-    for function, code in ((reversed_slope, RESULTS.no_descent), (lambda x: x, RESULTS.successful)):
+    for function, code in ((reversed_slope, jd.RESULTS.no_descent), (lambda x: x, jd.RESULTS.successful)):
         force = Partial(lambda c, system, q, v, t, function=function: function(c), jnp.zeros(1))
         fit = identify.fit_parameters(
-            Scene(scenes.pendulum(mass=1.0, length=1.0).system, (), (force,)),
+            jd.Scene(scenes.pendulum(mass=1.0, length=1.0).system, (), (force,)),
             log,
             objective=identify.Objective("torque"),
             solver=identify.Solver(method=method),
@@ -317,7 +316,7 @@ def test_descent_in_reverse_mode(oscillation, method):
         return w["out"] @ jnp.tanh(w["in"] @ x + w["bias"])
 
     lacking = oscillator(stiffness=4.0, drive=0.0)
-    scene = Scene(lacking.system, (), (*lacking.forces, Partial(network, weights)))
+    scene = jd.Scene(lacking.system, (), (*lacking.forces, Partial(network, weights)))
     options: dict = dict(horizon=20, substeps=4)
     fit = identify.fit_parameters(
         scene,
@@ -336,8 +335,10 @@ def test_trajectories_on_constraints():
     """Gravity and drag of a particle on a rod by its motion."""
     t = jnp.linspace(0, 1, 21)
     rod = scenes.pendulum_in_plane()
-    held = Scene(rod.system, rod.constraints, (JointDamping(0.3),))
-    motion = simulate(held, *scenes.pendulum_in_plane.start(), t, stepsize=Steps(rtol=1e-12, atol=1e-12))
+    held = jd.Scene(rod.system, rod.constraints, (jd.forces.JointDamping(0.3),))
+    motion = jd.simulate(
+        held, *scenes.pendulum_in_plane.start(), t, stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12)
+    )
     log = identify.Log(t, motion.q, motion.v, None, jnp.zeros((21, 2)))
     chosen = lambda scene: [scene.system.parameters["gravity"], scene.forces[0].coefficient]  # noqa: E731
     wrong = eqx.tree_at(chosen, held, [jnp.asarray(7.0), jnp.asarray(0.1)])
@@ -381,7 +382,7 @@ def test_float32(oscillation):
 
 
 def test_bad_choices_are_refused(swung, oscillation):
-    metric = MetricSystem(lambda q, t, p: p * jnp.eye(1), 1, parameters=jnp.asarray([[1.0, 0.0]])[0, :1])
+    metric = jd.MetricSystem(lambda q, t, p: p * jnp.eye(1), 1, parameters=jnp.asarray([[1.0, 0.0]])[0, :1])
 
     def fit(system, log=oscillation, error="trajectory", **options):
         return lambda: identify.fit_parameters(system, log, objective=identify.Objective(error), **options)
@@ -389,7 +390,7 @@ def test_bad_choices_are_refused(swung, oscillation):
     def objective(error, **options):
         return lambda: identify.Objective(error, **options)
 
-    builder = ModelBuilder("slider")
+    builder = jd.ModelBuilder("slider")
     builder.add_body("mass", None, "prismatic", inertia=(1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
     model, parameters = builder.build(), lambda s: s.system.parameters
     rod = scenes.pendulum_in_plane()
@@ -439,6 +440,6 @@ def test_bad_choices_are_refused(swung, oscillation):
     for message, call in refused.items():
         with pytest.raises(ValueError, match=message):
             call()
-    free = LagrangianSystem(lambda q, v: 0.5 * v[0] ** 2, 1)
+    free = jd.LagrangianSystem(lambda q, v: 0.5 * v[0] ** 2, 1)
     with pytest.raises(ValueError, match=r"model is a LagrangianSystem; .* with jd\.identify\.fit_parameters"):
         check_bodies(free)

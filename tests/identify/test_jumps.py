@@ -10,10 +10,7 @@ from benchmarks.identify_franka import samples
 from benchmarks.identify_robots import kuka_samples
 from jaxdyn import identify
 from jaxdyn.cli import main
-from jaxdyn.identify import LogWarning
 from jaxdyn.identify.log_repair import find_outliers, repair_log, unwrap_angles
-from jaxdyn.io.logs import read_log, write_log
-from jaxdyn.model.builder import ModelBuilder
 
 LENGTHS, MASSES, ROTATIONAL, GRAVITY = (0.5, 0.4), (2.0, 1.0), 0.01, 9.81
 FILTER = dict(cutoff=20.0, trim=50, every=2)
@@ -62,7 +59,7 @@ def clean():
 
 
 def make_arm(kind="continuous", masses=MASSES, **limits):
-    builder = ModelBuilder("arm")
+    builder = jd.ModelBuilder("arm")
     parent, pose = None, None
     for name, joint, mass, length in zip(("upper", "lower"), ("shoulder", "elbow"), masses, LENGTHS, strict=True):
         builder.add_body(
@@ -102,7 +99,7 @@ def test_wrapped_angles_give_the_fit_of_the_unwrapped_ones(clean, kind):
     count = int(np.sum(np.abs(np.diff(wrapped.q[:, 0])) > 3))
     assert count == 6
     model = None if kind is None else make_arm(kind)
-    with pytest.warns(LogWarning, match=rf"whole turns were unwrapped: joint shoulder \({count} jumps\)$"):
+    with pytest.warns(jd.identify.LogWarning, match=rf"whole turns were unwrapped: joint shoulder \({count} jumps\)$"):
         log = from_raw(wrapped, model=model)
     reference = from_raw(clean)
     np.testing.assert_allclose(log.q, reference.q, atol=1e-10)
@@ -130,7 +127,7 @@ def test_only_jumps_near_whole_turns_are_wraps(clean):
         ):
             from_raw(log, outliers=outliers)
     # Forced, it is brought within half a turn, as numpy does it.
-    with pytest.warns(LogWarning, match=r"joint elbow \(1 jump\)"):
+    with pytest.warns(jd.identify.LogWarning, match=r"joint elbow \(1 jump\)"):
         forced = unwrap_angles(log, near=False)
     np.testing.assert_allclose(forced.q[:, 1], np.unwrap(log.q[:, 1]), atol=1e-12)
 
@@ -143,7 +140,7 @@ def test_joints_that_turn_fast(speed):
     log = identify.Log(t, q, tau=0 * q)
     assert repair_log(log) is log
     if speed < np.pi / (1.01 * t[1]):
-        with pytest.warns(LogWarning) if speed * 4 > np.pi else warnings.catch_warnings():
+        with pytest.warns(jd.identify.LogWarning) if speed * 4 > np.pi else warnings.catch_warnings():
             unwrapped = repair_log(wrap(log))
         np.testing.assert_allclose(unwrapped.q, q, atol=1e-9)
 
@@ -153,7 +150,7 @@ def test_noise_does_not_hide_wraps_nor_look_like_them(clean):
     noise = 0.02 * generator.normal(size=clean.q.shape)  # forward and back over the edge, several times in each passage
     noisy = identify.Log(clean.t, np.asarray(clean.q) + noise, tau=clean.tau + generator.normal(size=noise.shape))
     assert repair_log(noisy) is noisy
-    with pytest.warns(LogWarning, match="unwrapped"):
+    with pytest.warns(jd.identify.LogWarning, match="unwrapped"):
         np.testing.assert_allclose(repair_log(wrap(noisy)).q, noisy.q, atol=1e-10)
 
 
@@ -171,7 +168,8 @@ def test_corrupted_positions_are_refused_or_left_out(clean, size, length, start)
     with pytest.raises(ValueError, match=rf"q of joint elbow is \S+ at rows? {start}\D.*outliers=\"drop\""):
         from_raw(bad)
     with pytest.warns(
-        LogWarning, match=rf"{length} corrupted samples? left out and interpolated: q of joint elbow \({length}\)$"
+        jd.identify.LogWarning,
+        match=rf"{length} corrupted samples? left out and interpolated: q of joint elbow \({length}\)$",
     ):
         repaired = repair_log(bad, outliers="drop")
     # Linear interpolation over 2 ms a sample: gap^2 / 8 of the largest acceleration, 13 rad/s^2; at the ends gap (gap + h) / 2.
@@ -185,7 +183,9 @@ def test_corrupted_torques(clean):
     bad = change(clean, "tau", 1234, 0, 1e4)
     with pytest.raises(ValueError, match=r"tau of joint shoulder is 10000 at row 1234 \(t=2.468 s\)"):
         from_raw(bad)
-    with pytest.warns(LogWarning, match=r"1 corrupted sample left out and interpolated: tau of joint shoulder \(1\)"):
+    with pytest.warns(
+        jd.identify.LogWarning, match=r"1 corrupted sample left out and interpolated: tau of joint shoulder \(1\)"
+    ):
         np.testing.assert_allclose(fit_masses(from_raw(bad, outliers="drop")), MASSES, rtol=2e-3)
     # Steps, bang-bang torques and spikes within what friction does are no faults.
     generator = np.random.default_rng(1)
@@ -202,7 +202,7 @@ def test_several_faults_in_one_log(clean):
         bad = change(bad, "q", row, 1, generator.uniform(20, 50))
     with pytest.raises(ValueError, match=rf"q of joint elbow is .* at row {rows[0]} .*\(and 39 more\)"):
         repair_log(unwrap_quietly(bad))
-    with pytest.warns(LogWarning) as caught:
+    with pytest.warns(jd.identify.LogWarning) as caught:
         masses = fit_masses(from_raw(bad, outliers="drop"))
     assert ["unwrapped" in str(one.message) for one in caught] == [True, False]
     assert "40 corrupted samples left out" in str(caught[1].message)
@@ -211,7 +211,7 @@ def test_several_faults_in_one_log(clean):
 
 def unwrap_quietly(log):
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LogWarning)
+        warnings.simplefilter("ignore", jd.identify.LogWarning)
         return unwrap_angles(log)
 
 
@@ -239,15 +239,15 @@ def test_options_are_checked(clean, options, words):
 @pytest.mark.parametrize("suffix", ["csv", "npz"])
 def test_files(clean, tmp_path, suffix):
     path = tmp_path / f"log.{suffix}"
-    write_log(path, wrap(clean))
-    with pytest.warns(LogWarning, match="joint shoulder"):
-        np.testing.assert_allclose(read_log(path).q, clean.q, atol=1e-10)
-    np.testing.assert_array_equal(read_log(path, unwrap=False, outliers="keep").q, wrap(clean).q)
-    write_log(path, change(clean, "q", 77, 1, 9.0))
+    jd.io.write_log(path, wrap(clean))
+    with pytest.warns(jd.identify.LogWarning, match="joint shoulder"):
+        np.testing.assert_allclose(jd.read_log(path).q, clean.q, atol=1e-10)
+    np.testing.assert_array_equal(jd.read_log(path, unwrap=False, outliers="keep").q, wrap(clean).q)
+    jd.io.write_log(path, change(clean, "q", 77, 1, 9.0))
     with pytest.raises(ValueError, match=rf"log\.{suffix}: q of joint elbow is 9 at row 77 "):
-        read_log(path)
-    with pytest.warns(LogWarning, match="1 corrupted sample"):
-        np.testing.assert_allclose(read_log(path, outliers="drop").q, clean.q, atol=1e-4)
+        jd.read_log(path)
+    with pytest.warns(jd.identify.LogWarning, match="1 corrupted sample"):
+        np.testing.assert_allclose(jd.read_log(path, outliers="drop").q, clean.q, atol=1e-4)
 
 
 @pytest.mark.long
@@ -258,7 +258,7 @@ def test_command_line(clean, tmp_path, capsys):
     args = ["identify", "--urdf", str(urdf), "--log", str(path), "--out", str(out), "--cutoff", "20"]
     args += ["--terms", "viscous", "--v-s", "0.01", "--prior", "1e-6", "--weights", "none", "--robust", "none"]
     bad = change(wrap(clean), "q", 3210, 1, 25.0)
-    write_log(path, bad)
+    jd.io.write_log(path, bad)
     assert main(args) == 2
     text = capsys.readouterr().err
     assert "q of joint elbow is 25 at row 3210" in text and "--outliers drop" in text and 'outliers="' not in text
@@ -269,7 +269,7 @@ def test_command_line(clean, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "log.csv: angles that jump by whole turns were unwrapped: joint shoulder (" in text
     assert "log.csv: 1 corrupted sample left out and interpolated: q of joint elbow (1)" in text
-    write_log(path, clean)
+    jd.io.write_log(path, clean)
     assert main([*args[:-1], "none", "--out", str(tmp_path / "clean.urdf")]) == 0
     assert "unwrapped" not in (text := capsys.readouterr().out) and "corrupted" not in text
     base = identify.base_parameters(make_arm(), identify.TERMS)

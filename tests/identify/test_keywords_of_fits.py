@@ -7,10 +7,9 @@ import scipy.signal
 import scipy.stats
 from test_identify_robot import arm, measured, motion
 
+import jaxdyn as jd
 from jaxdyn import identify, inertia
-from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.regression import free_columns
-from jaxdyn.model.builder import ModelBuilder
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +110,7 @@ def test_keywords_of_drive_gains():
 def test_replays_of_a_cart():
     """A mass under torques that are held or linear between the samples, with viscous friction, in segments: closed forms."""
     mass, b = 2.0, 0.5
-    builder = ModelBuilder("cart", gravity=None)
+    builder = jd.ModelBuilder("cart", gravity=None)
     builder.add_body("cart", None, "prismatic", (mass, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(1, 0, 0))
     model, t, force = builder.build(), np.linspace(0, 2, 5), np.array([1.0, -1.0, 3.0, 0.0, 0.0])
     blank = np.zeros((5, 1))
@@ -157,7 +156,7 @@ def test_keywords_of_exciting_motions():
     log = found.log(500.0)
     assert (np.abs(log.v).max(axis=0) <= 0.5 * np.array([1.0, 2.0]) * (1 + 1e-3)).all()
     assert np.abs(log.q).max() <= 0.5 * np.pi * (1 + 1e-3) and max(found.used.values()) <= 1
-    assert found.result is RESULTS.max_steps_reached
+    assert found.result is jd.RESULTS.max_steps_reached
     # The search samples its period at 100 places, as the log at 25 Hz does.
     assert condition(found, identify.TERMS, 0.1) == pytest.approx(found.condition, rel=1e-6)
     other = identify.exciting_motion(model, terms=("viscous",), v_s=1.0, **few)
@@ -170,5 +169,5 @@ def test_keywords_of_exciting_motions():
     assert abs(again.condition / still.condition - 1) > 1e-3
     steps = []
     ended = identify.exciting_motion(model, callback=lambda step, loss: steps.append(loss) or step == 3, **few)
-    assert ended.result is RESULTS.stopped and len(ended.history) == 4
+    assert ended.result is jd.RESULTS.stopped and len(ended.history) == 4
     np.testing.assert_array_equal(steps, ended.history)

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from test_jumps import recorded
 
+import jaxdyn as jd
 from jaxdyn import identify
 from jaxdyn.identify.logs import check_log
 from jaxdyn.identify.raw_logs import spline_lines
-from jaxdyn.io.logs import read_log, write_log
-from jaxdyn.model.builder import ModelBuilder
 
 N = 60
 
@@ -24,7 +23,7 @@ def signals():
 
 @pytest.fixture(scope="module")
 def arm():
-    builder = ModelBuilder("arm")
+    builder = jd.ModelBuilder("arm")
     builder.add_body("upper", joint_name="shoulder", inertia=(1.0, (0.1, 0, 0), (0.1, 0.1, 0.1)))
     builder.add_body("lower", "upper", joint_name="elbow", pose=(1, 0, 0), inertia=(1.0, (0.1, 0, 0), (0.1, 0.1, 0.1)))
     return builder.build()
@@ -65,7 +64,7 @@ def test_log_must_fit_the_model(signals, arm):
     check_log(log, arm)
     with pytest.raises(ValueError, match=r"1 columns of q, model 'arm' has 2 \(joints shoulder, elbow\)"):
         check_log(identify.Log(signals["t"], *(signals[k][:, :1] for k in ("q", "v", "a", "tau"))), arm)
-    with pytest.raises(ValueError, match=r"the log has no a; .*from_raw"):
+    with pytest.raises(ValueError, match="the log has no a"):
         check_log(identify.Log(**signals | dict(a=None)), arm)
     with pytest.raises(ValueError, match=r"joints are elbow, shoulder.*joint_names=model.joint_names"):
         check_log(identify.Log(**signals, joint_names=("elbow", "shoulder")), arm)
@@ -87,8 +86,8 @@ def test_files_there_and_back(signals, tmp_path, suffix, names):
     path = tmp_path / f"log.{suffix}"
     for given in (signals, signals | dict(v=None, a=None)):
         log = identify.Log(**given, joint_names=names)
-        write_log(path, log)
-        back = read_log(path)
+        jd.io.write_log(path, log)
+        back = jd.read_log(path)
         assert back.joint_names == names
         for name in ("t", "q", "v", "a", "tau"):
             np.testing.assert_array_equal(getattr(back, name), getattr(log, name))  # every digit
@@ -96,20 +95,20 @@ def test_files_there_and_back(signals, tmp_path, suffix, names):
 
 def test_columns_with_joint_names_follow_the_model(signals, tmp_path):
     path = tmp_path / "log.csv"
-    write_log(path, identify.Log(**signals, joint_names=("elbow", "shoulder")))
-    log = read_log(path, joint_names=("shoulder", "elbow"))
+    jd.io.write_log(path, identify.Log(**signals, joint_names=("elbow", "shoulder")))
+    log = jd.read_log(path, joint_names=("shoulder", "elbow"))
     np.testing.assert_array_equal(log.q, signals["q"][:, ::-1])
-    np.testing.assert_array_equal(read_log(path, joint_names=("elbow",)).tau, signals["tau"][:, :1])
-    with pytest.raises(ValueError, match="missing columns q_wrist, v_wrist, a_wrist, tau_wrist; the file has t"):
-        read_log(path, joint_names=("elbow", "wrist"))
+    np.testing.assert_array_equal(jd.read_log(path, joint_names=("elbow",)).tau, signals["tau"][:, :1])
+    with pytest.raises(ValueError, match="missing columns q_wrist, v_wrist, a_wrist, tau_wrist"):
+        jd.read_log(path, joint_names=("elbow", "wrist"))
 
 
 def test_npz_takes_whole_signals(signals, tmp_path):
     np.savez(tmp_path / "log.npz", **signals, note=np.array("ignored"))
-    np.testing.assert_array_equal(read_log(tmp_path / "log.npz").a, signals["a"])
+    np.testing.assert_array_equal(jd.read_log(tmp_path / "log.npz").a, signals["a"])
     np.savez(tmp_path / "flat.npz", t=signals["t"], q=signals["t"], tau=signals["t"])
     with pytest.raises(ValueError, match=r"flat.npz: q has shape \(60,\)"):
-        read_log(tmp_path / "flat.npz")
+        jd.read_log(tmp_path / "flat.npz")
 
 
 BAD_FILES = {
@@ -139,7 +138,7 @@ def test_bad_files_raise(tmp_path, case):
     path = tmp_path / "bad.csv"
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"bad\.csv: .*{message}"):
-        read_log(path)
+        jd.read_log(path)
 
 
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
@@ -148,7 +147,7 @@ def test_separators(tmp_path, separator):
     path.write_text(
         "\n".join(separator.join(row) for row in (("t", "q1", "tau1"), ("0", "0.5", "1"), ("1", "0.25", "2")))
     )
-    log = read_log(path)
+    log = jd.read_log(path)
     np.testing.assert_array_equal(log.q[:, 0], [0.5, 0.25])
     np.testing.assert_array_equal(log.tau[:, 0], [1, 2])
 
@@ -156,25 +155,25 @@ def test_separators(tmp_path, separator):
 def test_joints_of_other_names(signals, tmp_path):
     """The message offers the mapping, and the mapping does it."""
     path = tmp_path / "log.csv"
-    write_log(path, identify.Log(**signals, joint_names=("m1", "m2")))
+    jd.io.write_log(path, identify.Log(**signals, joint_names=("m1", "m2")))
     with pytest.raises(ValueError, match=r"missing columns q_shoulder.*rename them: m1=shoulder m2=elbow"):
-        read_log(path, joint_names=("shoulder", "elbow"))
-    log = read_log(path, joint_names=("shoulder", "elbow"), rename={"m1": "shoulder", "m2": "elbow"})
+        jd.read_log(path, joint_names=("shoulder", "elbow"))
+    log = jd.read_log(path, joint_names=("shoulder", "elbow"), rename={"m1": "shoulder", "m2": "elbow"})
     np.testing.assert_array_equal(log.tau, signals["tau"])
     with pytest.raises(ValueError, match="rename: no column is of joint m3"):
-        read_log(path, rename={"m3": "wrist"})
+        jd.read_log(path, rename={"m3": "wrist"})
 
 
 def test_unreadable_files_raise(tmp_path, signals):
     with pytest.raises(FileNotFoundError, match=r"gone\.csv: no such log file"):
-        read_log(tmp_path / "gone.csv")
+        jd.read_log(tmp_path / "gone.csv")
     with pytest.raises(ValueError, match=r"are \.csv or \.npz, not '\.mat'"):
-        read_log(tmp_path / "log.mat")
+        jd.read_log(tmp_path / "log.mat")
     with pytest.raises(ValueError, match=r"are \.csv or \.npz, not '\.txt'"):
-        write_log(tmp_path / "log.txt", identify.Log(**signals))
+        jd.io.write_log(tmp_path / "log.txt", identify.Log(**signals))
     np.savez(tmp_path / "log.npz", t=np.arange(3.0), q1=np.arange(3.0), tau1=np.arange(2.0))
     with pytest.raises(ValueError, match="unequal lengths: t has 3 rows, q1 has 3 rows, tau1 has 2 rows"):
-        read_log(tmp_path / "log.npz")
+        jd.read_log(tmp_path / "log.npz")
 
 
 def test_from_raw_recovers_a_slow_sine():
@@ -268,7 +267,7 @@ def test_from_raw_refuses_counts(options, words):
 def test_cells_that_only_python_reads_are_refused(cell, tmp_path):
     (tmp_path / "log.csv").write_text(f"t,q1,tau1\n0,0,0\n1,{cell},0\n", encoding="utf-8")
     with pytest.raises(ValueError, match=f"line 3, column q1: '{cell}' is no number"):
-        read_log(tmp_path / "log.csv")
+        jd.read_log(tmp_path / "log.csv")
 
 
 @pytest.mark.parametrize(
@@ -287,10 +286,10 @@ def test_units_and_numbers_that_would_be_misread_are_refused(header, words, tmp_
     path, n = tmp_path / "log.csv", header.count(",") + 1
     path.write_text("\n".join([header, *(",".join([str(i)] * n) for i in range(3))]), encoding="utf-8")
     with pytest.raises(ValueError, match=words):
-        read_log(path)
+        jd.read_log(path)
     # The same unit of a column that is not read does no harm.
     path.write_text("t [s],q1 [rad],tau1 [N m],speed [rpm]\n0,1,2,3\n1,1,2,3\n", encoding="utf-8")
-    assert read_log(path).q.shape == (2, 1)
+    assert jd.read_log(path).q.shape == (2, 1)
 
 
 @pytest.mark.parametrize("order", [("1", "10", "2"), None])
@@ -298,7 +297,7 @@ def test_joints_whose_names_are_numbers(order, tmp_path):
     """A model sorts its joints by their names as texts: 1, 10, 2. Their columns are no numbers of columns."""
     path = tmp_path / "log.csv"
     path.write_text("t,q_1,q_10,q_2,tau_1,tau_10,tau_2\n0,1,10,2,1,10,2\n1,1,10,2,1,10,2\n")
-    log = read_log(path, joint_names=order)
+    log = jd.read_log(path, joint_names=order)
     assert log.joint_names == ("1", "10", "2")
     np.testing.assert_array_equal(log.q, [[1, 10, 2]] * 2)
     np.testing.assert_array_equal(log.tau, log.q)
@@ -307,9 +306,9 @@ def test_joints_whose_names_are_numbers(order, tmp_path):
 def test_logs_in_other_encodings_are_refused_with_their_line(tmp_path):
     (tmp_path / "log.csv").write_bytes("t,q_机,tau_机\n0,0,0\n".encode("gbk"))
     with pytest.raises(ValueError, match=r"log.csv: line 1 is not UTF-8 .*; save the file as UTF-8"):
-        read_log(tmp_path / "log.csv")
+        jd.read_log(tmp_path / "log.csv")
     (tmp_path / "log.csv").write_text("t,q_机,tau_机\n0,0,0\n1,2,3\n", encoding="utf-8-sig")
-    np.testing.assert_array_equal(read_log(tmp_path / "log.csv").tau, [[0.0], [3.0]])
+    np.testing.assert_array_equal(jd.read_log(tmp_path / "log.csv").tau, [[0.0], [3.0]])
 
 
 @pytest.mark.parametrize("t", [np.array(["0", "1_0"]), np.array([0.0, 1j]), ["0", "1"]])

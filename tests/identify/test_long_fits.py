@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import descent
 
 _SCRIPT = """
@@ -101,7 +100,7 @@ def test_a_stopped_fit_resumes_to_the_same_numbers(tmp_path, method):
     path = tmp_path / "fit.ckpt"
     start = dict(method=method, start=(0.2, 2.6, 0.9), steps=12)
     part = fitted(path, callback=lambda step, *_: step == 3, **start)
-    assert part.result == RESULTS.stopped and len(part.history) == 4
+    assert part.result == jd.RESULTS.stopped and len(part.history) == 4
     resumed, whole = fitted(path, **start), fitted(None, **start)
     np.testing.assert_array_equal(resumed.history, whole.history)
     np.testing.assert_array_equal(resumed.values, whole.values)
@@ -151,7 +150,7 @@ def test_solvers_agree_and_progress_is_shown(capsys):
             free=linear,
         )
         np.testing.assert_allclose(fit.values, [want], rtol=1e-6)
-        assert fit.result == RESULTS.successful
+        assert fit.result == jd.RESULTS.successful
         np.testing.assert_allclose(fit.history[-1], fit.history.min(), rtol=1e-12)
     assert "step 0 of at most 200: loss" in capsys.readouterr().err
 
@@ -178,7 +177,7 @@ def test_a_nan_names_its_log_sample_and_parameter():
     early = jd.identify.Log(log.t / 3, log.q, log.v, log.a, log.tau)
     bad = jd.ExplicitSystem(mass, root_push, 1, parameters={"square": 1.0, "late": 2.0})
     fit = jd.identify.fit_parameters(bad, [early, log], objective=jd.identify.Objective("torque"), free=pick)
-    assert fit.result == RESULTS.nonfinite and fit.cause is not None
+    assert fit.result == jd.RESULTS.nonfinite and fit.cause is not None
     first = int(np.argmax(log.t > 2.0))
     assert f"errors of log 2 are not finite from sample {first} on" in fit.cause
     # A step that led there, by gradient descent: the parameter that did it is named.
@@ -190,5 +189,7 @@ def test_a_nan_names_its_log_sample_and_parameter():
         solver=jd.identify.Solver(method="adam", learning_rate=0.9, steps=20),
         free=pick,
     )
-    assert steep.result == RESULTS.nonfinite and "; finite with parameters['late'] where it started" in str(steep.cause)
+    assert steep.result == jd.RESULTS.nonfinite and "; finite with parameters['late'] where it started" in str(
+        steep.cause
+    )
     assert np.isfinite(steep.values).all() and float(steep.system.parameters["late"]) < 1

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import chart
 from jaxdyn.identify.options import energy_balance, momentum_balance
 from jaxdyn.identify.result import segments
@@ -244,7 +243,7 @@ def test_geometry_gravity_and_sensors_are_found_together(log):
     np.testing.assert_allclose([computed[f"torque_gain[{i}]"] for i in range(3)], gain, rtol=2e-2)
     # Torques between samples are taken as linear, which is what is left.
     np.testing.assert_allclose(computed["delay"], delay, atol=1e-3)
-    assert fit.history[-1] < 1e-4 * fit.history[0] and fit.result == RESULTS.successful
+    assert fit.history[-1] < 1e-4 * fit.history[0] and fit.result == jd.RESULTS.successful
     assert fit.error(recorded) < 5
 
 
@@ -288,7 +287,7 @@ def test_a_length_that_enters_everywhere_is_found(log):
     assert alone.values.shape == (1,)
     with pytest.raises(ValueError, match="build is 3; give a function"):
         jd.identify.Construction(3, {})
-    with pytest.raises(ValueError, match="numbers has 'long'; give floating-point numbers"):
+    with pytest.raises(ValueError, match="numbers has 'long'"):
         jd.identify.Construction(build, {"length": "long"})
 
 
@@ -325,4 +324,4 @@ def test_numbers_of_a_controlled_arm_by_its_motion_in_closed_loop():
     np.testing.assert_allclose(damping, [0.3, 0.2], rtol=2e-3)
     np.testing.assert_allclose(fit.scene.system.inertias[1, 0], 0.5, rtol=1e-4)
     # Per cent; what steps of 5 ms leave.
-    assert fit.result == RESULTS.successful and jd.identify.parameter_error(fit.system, log, objective) < 1e-2
+    assert fit.result == jd.RESULTS.successful and jd.identify.parameter_error(fit.system, log, objective) < 1e-2

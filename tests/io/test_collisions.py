@@ -79,14 +79,12 @@ def test_chosen_links_and_refusals(urdf):
     scene = silent(urdf, contacts=["sphere", "capsule"])
     assert set(touching_of(scene)) == {"sphere", "capsule 0", "capsule 1"}
     assert not touching_of(silent(urdf))
-    with pytest.raises(
-        ValueError, match=r"link 'sphre' is unknown \(did you mean sphere.*\); it has no collision shape"
-    ):
+    with pytest.raises(ValueError, match=r"link 'sphre' is unknown \(did you mean sphere.*\)"):
         silent(urdf, contacts=["sphre"])
     for wrong in ("floor", 3, [1]):
         with pytest.raises(ValueError, match="give 'ground', a list of names of links"):
             silent(urdf, contacts=wrong)
-    with pytest.raises(ValueError, match=r"contacts\['sphere'\] is 0; give a positive"):
+    with pytest.raises(ValueError, match=r"contacts\['sphere'\] is 0"):
         silent(urdf, contacts={"sphere": 0})
     lowest = touching_of(silent(urdf, contacts={"sphere": 1, "box": 4}))
     assert sorted(lowest) == ["box 0", "box 1", "box 2", "box 3", "sphere"]

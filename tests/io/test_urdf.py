@@ -299,7 +299,7 @@ def test_mimic_joints():
     expected = jd.load_model(panda, lock={"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03})
     assert_same_models(held, expected)
     assert jd.load_model(panda, lock=["panda_finger_joint1"]).nv == 8
-    with pytest.raises(ValueError, match="'panda_finger_joint2' follows 'panda_finger_joint1'; lock that one instead"):
+    with pytest.raises(ValueError, match="'panda_finger_joint2' follows 'panda_finger_joint1'"):
         jd.load_model(panda, mimic="couple", lock=["panda_finger_joint2"])
     with pytest.raises(ValueError, match=r"'panda_finger_joint2' is held at .*0.01.* but follows"):
         jd.load_model(panda, mimic="couple", lock={"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.01})
@@ -827,5 +827,5 @@ def test_packages_of_xacro_files_without_ros(tmp_path):
         jd.load_model(path, packages={"elsewhere": "nowhere"})
     other = tmp_path / "r.urdf"
     other.write_text("<robot name='r'><link name='a'/></robot>")
-    with pytest.raises(ValueError, match=r"packages is .* is no .xacro file; leave it out"):
+    with pytest.raises(ValueError, match=r"packages is .* is no \.xacro file"):
         jd.load_model(other, packages={"a": "b"})

@@ -163,7 +163,7 @@ def test_joints_in_gazebo_elements_close_loops(tmp_path, kind, loop, axes, rows)
         np.testing.assert_allclose(*open_by, rtol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rounding_out_of_the_plane_takes_no_freedom(tmp_path):
     """The axes of a planar linkage agree to rounding; their two rows are dependent and not two more."""
     scene = jd.load(
@@ -204,7 +204,7 @@ def test_plugins_that_mimic_fixed_joints(tmp_path):
     ):
         jd.load(write(tmp_path, extra=plugin("z", "c")))
     assert jd.load(tmp_path / "bars.urdf", lock={"c": 0.3}).system.nv == free.nv - 1
-    with pytest.raises(ValueError, match=r"bars.urdf:\d+: joint 'c' follows 'a' already; keep one"):
+    with pytest.raises(ValueError, match=r"bars.urdf:\d+: joint 'c' follows 'a' already"):
         jd.load(write(tmp_path, extra=plugin("a", "c") + plugin("b", "c")))
     with pytest.raises(ValueError, match=r"mimic is 'couple', but .*MJCF"):
         (tmp_path / "b.mjcf").write_text("<mujoco/>")
@@ -263,7 +263,7 @@ def test_bad_loops_arguments(tmp_path):
     path = write(tmp_path)
     with pytest.raises(ValueError, match=r"nowhere\.yaml cannot be read"):
         jd.load(path, loops=tmp_path / "nowhere.yaml")
-    with pytest.raises(ValueError, match="loops is True; pass the path of a file"):
+    with pytest.raises(ValueError, match="loops is True"):
         jd.load(path, loops=True)
     empty = tmp_path / "empty.yaml"
     empty.write_text("a: 1", encoding="utf-8")

@@ -339,7 +339,7 @@ def test_log_to_second_order(name, dtype):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_quaternions_to_second_order(dtype):
     a, b = directions("so3")
     # The logarithm does not see the length of q, so every direction of R^4 is tested, from a length that is not 1,

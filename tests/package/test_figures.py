@@ -1,9 +1,7 @@
 """Tables of figures in the documents have a command that measures them."""
 
 import importlib.util
-import re
 
-import pytest
 from pages import ROOT
 
 from benchmarks import figures
@@ -51,27 +49,6 @@ def test_printed_tables_replace_those_of_the_page(tmp_path):
     assert [table.commit for table in figures.tables(page)] == ["5ab", "5ab", None] and "| x | 7 |" in page.read_text()
     written, missing = figures.replace(page, "benchmarks.stiff a", "", "Measured at commit 3, m.")
     assert written == 0 and missing == ["| case | us |", "|  case | us |"]
-
-
-@pytest.mark.parametrize(
-    "row,is_figures", [("| a | 1.5 (2) | x |", True), ("| a | b | 3 |", True), ("| a | b | c |", False)]
-)
-def test_tables_of_words_need_no_command(row, is_figures):
-    assert figures.has_figures(f"| h | i | j |\n|---|---|---|\n{row}\n") is is_figures
-
-
-history = pytest.mark.skipif(not figures.has_history(), reason="no history of the repository, or not all of it")
-
-
-@history
-def test_ages_are_those_of_the_note_or_of_the_text():
-    one = next(table for table in figures.tables(ROOT / "docs" / "report.md"))
-    assert re.search("no note; text changed at |measured at ", figures.age(one)[1])
-    head = figures._git("rev-parse", "--short", "HEAD")
-    count, note = figures.age(one._replace(commit=head))
-    assert count == 0 and note.startswith(f"measured at {head}, 0 commits to jaxdyn/")
-    first = figures._git("rev-list", "--max-parents=0", "HEAD").split()[0]
-    assert figures.age(one._replace(commit=first))[0] > figures.LIMIT
 
 
 def test_code_that_a_command_measures_exists():

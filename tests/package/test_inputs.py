@@ -17,7 +17,6 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from jaxdyn.cli.common import output_path
 from jaxdyn.constraints.codes import CODES, name_of
-from jaxdyn.constraints.frames import constraint_forces
 from jaxdyn.simulation.solution import OF_DIFFRAX, from_diffrax
 
 ARM = jd.robots.chain(2)
@@ -72,7 +71,7 @@ OF_SYSTEMS = {
 OF_SCENES = {
     "assemble": (lambda s, q, v: jd.assemble(s, q, v).q, Q, V),
     "constrained_dynamics": (lambda s, q, v, tau: jd.constrained_dynamics(s, q, v, tau).acceleration, Q, V, A),
-    "constraint_forces": (lambda s, q, lam: list(constraint_forces(s, q, lam).values()), Q, NU),
+    "constraint_forces": (lambda s, q, lam: list(jd.constraint_forces(s, q, lam).values()), Q, NU),
     "constraint_jacobian": (jd.constraint_jacobian, Q),
     "gauge_invariant": (lambda s, q, v, tau: jd.reduction.gauge_invariant(s, q, v, tau).acceleration, Q, V, A),
     "involutive": (lambda s, q: jd.reduction.involutive(s, q).singular_values, Q),
@@ -189,7 +188,7 @@ def test_a_batch_without_vmap_is_told_so():
     with pytest.raises(ValueError, match=r"nu has shape \(4, 1\).*jax\.vmap"):
         jd.reduced_dynamics(CHAIN, Q, jnp.ones((4, 1)), basis=(0,))
     with pytest.raises(ValueError, match=r"multipliers has shape \(4, 1\).*jax\.vmap"):
-        constraint_forces(CHAIN, Q, jnp.ones((4, 1)))
+        jd.constraint_forces(CHAIN, Q, jnp.ones((4, 1)))
     with pytest.raises(ValueError, match=r"stepsize has shape \(2,\).*jax\.vmap"):
         jd.simulate(ARM, [0, 0], [0, 0], [0, 1], stepsize=[0.1, 0.2])
 
@@ -198,7 +197,6 @@ def stiffer(q, v, t):
     return -q if t < 0.5 else q
 
 
-GIVEN_STEPS = diffrax.StepTo(jnp.linspace(0, 1, 5))
 OPTIONS = [
     ({"stepsize": jd.simulation.Steps(rtol=np.inf)}, "rtol is inf; pass a finite number"),
     ({"stepsize": jd.simulation.Steps(rtol=-1)}, "rtol is -1; pass a finite number that is not negative"),
@@ -405,7 +403,7 @@ def test_motions_start_from_unit_quaternions(modes):
     scene = jd.Scene(model, forces=(jd.contact.DryFriction(0.3, normal=1.0, along=0),) if modes else ())
     starts = jnp.asarray([[1.0, 0, 0, 0], [2.0, 0, 0, 0], [1.0002, 0, 0, 0], [0.0, 0, 0, 0], [jnp.nan, 0, 0, 0]])
     v0, options = jnp.asarray([1.0, 0.2, 0.1]), {"throw": False} | ({} if modes else {"stepsize": 0.05})
-    with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1; divide it by its length"):
+    with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1"):
         jd.simulate(scene, starts[1], v0, [0.0, 0.1], **options)
     run = jax.jit(jax.vmap(lambda q: jd.simulate(scene, q, v0, [0.0, 0.1], **options)))
     computed = run(starts)
@@ -426,7 +424,7 @@ def test_codes_of_a_batch_print_as_words():
     stalled = jax.jit(lambda x: jd.RESULTS.where(x > 0, jd.RESULTS.successful, jd.RESULTS.stalled))(0.0)
     assert f"{stalled}" == "stalled" and "not solved to the tolerance" in jd.RESULTS[stalled]
     assert repr(pickle.loads(pickle.dumps(stalled))) == "stalled"
-    with pytest.raises(ValueError, match=r"compared with 0; compare it with jd.RESULTS.successful"):
+    with pytest.raises(ValueError, match="compared with 0"):
         assert one.result == 0
 
 

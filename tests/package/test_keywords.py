@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.contact import Plane, Sphere
 
 ARM = jd.robots.iiwa()
 HAND = ARM.body_names[-1]
@@ -73,9 +72,9 @@ CALLS = {
     "contact.ground_contact": args("a", friction=0.3, static=0.4, plane_body="b", name="foot"),
     "contact.shape_contacts": args(
         "a",
-        Sphere(0.1),
+        jd.contact.Sphere(0.1),
         pose=(0, 0, 0.1),
-        on=Plane(),
+        on=jd.contact.Plane(),
         surface=(0, 0, 0.1),
         surface_body="b",
         friction=0.3,
@@ -85,7 +84,7 @@ CALLS = {
     "contact.optimal_forces": args(
         G3, jnp.ones(6), [CONE] * 3, preload=0.1, target=jnp.ones(9), weights=jnp.ones(9), tol=1e-08
     ),
-    "contact.rolling_contact": args("a", Sphere(0.1), "b", Plane(), spin=True, name="rolling"),
+    "contact.rolling_contact": args("a", jd.contact.Sphere(0.1), "b", jd.contact.Plane(), spin=True, name="rolling"),
     "contact.solve_qp": args(jnp.eye(9), jnp.ones(9), A=G3, b=jnp.ones(6), tol=1e-08, max_steps=20),
     "contact.wrench_basis": args("hard-finger", in_plane=True),
     "control.foot": args("FL_foot", CONE, pose=np.eye(4), ground=np.eye(3)),

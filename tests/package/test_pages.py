@@ -11,7 +11,6 @@ import pytest
 from pages import ROOT, anchors, links, pages, run
 
 import jaxdyn as jd
-from benchmarks import browser, gallery
 from benchmarks.gallery import SCENES
 
 
@@ -51,30 +50,6 @@ def test_modules_that_the_page_on_design_lists_exist():
 def test_gallery_shows_what_its_command_makes():
     shown = re.findall(r"\(gallery/(\w+)\.gif\)", (ROOT / "docs" / "gallery.md").read_text())
     assert shown == list(SCENES) and set(shown) <= set(jd.scenes.names())
-
-
-def test_pictures_are_made_again_for_code_alone():
-    source = 'def f(x):\n    "a"\n    return x + 1  # one\n'
-    assert gallery._code(source) == gallery._code("def f(x):\n    return (x + 1)\n")
-    assert gallery._code(source) != gallery._code(source.replace("1", "2"))
-    assert gallery.digest("four_bar") != gallery.digest("bicycle")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(browser.browser() is None, reason="no browser is installed")
-def test_browser_reports_what_it_does_not_show(tmp_path):
-    good = '<article>text<div class="arithmatex"><span class="katex">x</span></div></article>'
-    wide = '<article><p style="width: 600px">wide</p></article>'
-    bad = r'<article><div class="arithmatex">\[x\]</div>, $\dot x$<img src="none.png"></article>'
-    for name, body in (("good", good), ("wide", wide), ("bad", bad)):
-        (tmp_path / f"{name}.html").write_text(f"<!doctype html><body style='margin: 0'>{body}</body>")
-    found = browser.faults(tmp_path)
-    assert not any(fault.startswith("/good.html") for fault in found)
-    assert [fault for fault in found if fault.startswith("/wide.html")] == [
-        "/wide.html at 400 pixels: page is 600 pixels wide: P wide"
-    ]
-    for what in ("formula is not set", "source of a formula", "picture is not shown: none.png"):
-        assert sum(fault.startswith("/bad.html") and what in fault for fault in found) == 2, found
 
 
 def exports() -> set[str]:

@@ -14,8 +14,6 @@ from pages import ROOT
 
 import jaxdyn as jd
 from benchmarks import argument_tables
-from jaxdyn.constraints.base import Constraint
-from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.system import System
 
 REFERENCE = ROOT / "docs" / "reference"
@@ -151,9 +149,9 @@ def use(value, systems: list) -> None:
                     jd.simulate(value, q, v, [0.0, 1e-3], throw=False)  # its force has modes, which a motion tracks
                 else:
                     value.applied_force(q, v)
-            elif isinstance(value, Constraint):
+            elif isinstance(value, jd.constraints.Constraint):
                 jd.constraint_jacobian(jd.Scene(system, [value]), q)
-            elif isinstance(value, Controller):
+            elif isinstance(value, jd.Controller):
                 start = value.start(q, v, jnp.zeros(()))
                 value(q, v, jnp.zeros(()), start)
             else:
@@ -169,7 +167,7 @@ def use_what_was_made(before: dict, names: dict) -> int:
     scenes = [x for x in names.values() if isinstance(x, jd.Scene)]
     systems = [x for x in names.values() if isinstance(x, System | jd.Model)] + [scene.system for scene in scenes]
     made = [x for name, x in names.items() if before.get(name) is not x]
-    wanted = [x for x in made if isinstance(x, Constraint | Controller | jd.Scene) or is_force(x)]
+    wanted = [x for x in made if isinstance(x, jd.constraints.Constraint | jd.Controller | jd.Scene) or is_force(x)]
     for value in wanted:
         fixed = value if isinstance(value, jd.Scene) else getattr(value, "scene", None)
         use(value, systems if fixed is None else [fixed.system])
@@ -252,31 +250,3 @@ def test_tables_describe_all_arguments_and_no_others():
         if not row.text
     ]
     assert not empty and not unknown, "\n".join([*empty, *unknown])
-
-
-def test_what_a_docstring_leaves_to_another_one_is_found_there():
-    given = [argument_tables.Argument(name, "", None) for name in ("tol", "steps")]
-    known = argument_tables.descriptions(
-        {
-            "jd.a.fit": ("**Arguments:** as of `solve`, and\n\n- `steps`: at most.\n\n**Returns:** x.", given),
-            "jd.a.solve": ("**Arguments:** `tol`: of the residual.", given[:1]),
-            "jd.b.check": ("**Arguments:** as of `a.fit`.", given),
-        }
-    )
-    assert known["jd.b.check"] == known["jd.a.fit"] == {"tol": "of the residual.", "steps": "at most."}
-
-
-def test_tables_of_arguments_keep_names_shapes_and_groups():
-    arguments = [
-        argument_tables.Argument(name, "Float[Array, ' nq'] | None", None) for name in ("model", "q", "v", "t")
-    ]
-    general, table = argument_tables.rows("as of `f`; `q` (nq,), `v` (nv,): the state. `t`, s.", arguments)
-    assert general == "as of `f`;"
-    shown = [([name for _, name in row.arguments], row.text) for row in table]
-    assert shown == [
-        (["`model`"], "the bodies and joints."),
-        (["`q` (nq,)", "`v` (nv,)"], "the state."),
-        (["`t`"], "time, s."),
-    ]
-    assert argument_tables.readable("Float[Array, ' nq'] | None") == "array (nq,) | None"
-    assert argument_tables.readable("Checked[Float[Array, ...] | None]") == "array | None"

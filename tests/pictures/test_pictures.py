@@ -11,11 +11,10 @@ import pytest
 from matplotlib.figure import Figure
 
 import jaxdyn as jd
-from jaxdyn.io import NotTakenWarning
 from jaxdyn.model import host_math
 from jaxdyn.pictures import default_solids, motion, stage
 from jaxdyn.pictures.drawing import cone_sides, scale_forces
-from jaxdyn.pictures.solids import SIZES, Shape, Shapes, merge_meshes, refine, sharpen, simplify
+from jaxdyn.pictures.solids import SIZES, merge_meshes, refine, sharpen, simplify
 
 
 def volume(vertices, faces) -> float:
@@ -45,17 +44,17 @@ def inertia_of(vertices, faces, mass: float) -> np.ndarray:
 def test_triangles_of_solids_enclose_their_volume(kind, size, exact):
     pose = host_math.pose_matrix(((0.3, -0.2, 0.1), (0.3, 0.2, 0.5)), "pose")
     assert kind in SIZES
-    vertices, faces = Shape("body", kind, size, pose).triangles()
+    vertices, faces = jd.pictures.Shape("body", kind, size, pose).triangles()
     # Polygons of 24 sides lie inside of their circles: 1.1 % of the area, 3 % of a ball.
     assert volume(vertices, faces) == pytest.approx(exact, rel=1e-12 if kind == "box" else 0.04)
-    mirrored = Shape("body", "mesh", (1.0, -1.0, 1.0), pose, vertices=vertices, faces=faces)
+    mirrored = jd.pictures.Shape("body", "mesh", (1.0, -1.0, 1.0), pose, vertices=vertices, faces=faces)
     assert volume(*mirrored.triangles()) > 0
     again = sharpen(*merge_meshes([(vertices, faces)]))
     assert volume(*again) == pytest.approx(volume(vertices, faces), rel=1e-12)
 
 
 def test_simplified_meshes_are_small_and_close():
-    vertices, faces = Shape("b", "ellipsoid", (1.0, 0.8, 0.6)).triangles()
+    vertices, faces = jd.pictures.Shape("b", "ellipsoid", (1.0, 0.8, 0.6)).triangles()
     few, triangles = simplify(vertices, faces, 100)
     assert len(few) <= 100 < len(vertices)
     assert np.abs(np.ptp(few, axis=0) / np.ptp(vertices, axis=0) - 1).max() < 0.15
@@ -69,7 +68,11 @@ def test_solids_of_inertia_have_that_inertia(moments):
     com, mass = np.array([0.1, 0.05, -0.02]), 2.0
     inertia = (mass, com, turn @ np.diag(moments) @ turn.T)
     model = jd.ModelBuilder("one").add_body("body", joint="spherical", inertia=inertia).build()
-    (solid,) = [shape for shape in default_solids.complete_solids(jd.Scene(model), Shapes()) if shape.kind != "capsule"]
+    (solid,) = [
+        shape
+        for shape in default_solids.complete_solids(jd.Scene(model), jd.pictures.Shapes())
+        if shape.kind != "capsule"
+    ]
     vertices, faces = solid.triangles()
     computed = inertia_of(vertices - com, faces, mass)
     # Round solids are polygons of 24 sides.
@@ -85,7 +88,7 @@ def test_every_scene_of_bodies_has_solids_and_a_stage():
     with_bodies = {name: scene for name, scene in built.items() if isinstance(scene.system, jd.Model)}
     assert len(with_bodies) > 20
     for name, scene in with_bodies.items():
-        shapes = default_solids.complete_solids(scene, Shapes())
+        shapes = default_solids.complete_solids(scene, jd.pictures.Shapes())
         assert shapes and shapes.frames() <= set(scene.system.frame_names), name
         for shape in shapes:
             assert volume(*shape.triangles()) > 0, name
@@ -127,8 +130,8 @@ def urdf(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def solids(urdf) -> Shapes:
-    with pytest.warns(NotTakenWarning, match=r"gone\.stl.*no such file"):
+def solids(urdf) -> jd.pictures.Shapes:
+    with pytest.warns(jd.io.NotTakenWarning, match=r"gone\.stl.*no such file"):
         return jd.pictures.shapes(urdf)
 
 
@@ -146,7 +149,7 @@ def test_solids_of_urdf(urdf, solids):
     # The lower arm has the tip's ball; nothing of inertia is added to bodies that have a solid.
     model = jd.load_model(urdf)
     assert {shape.source for shape in default_solids.complete_solids(jd.Scene(model), solids)} == {"file"}
-    whole = default_solids.complete_solids(jd.Scene(model), Shapes([box]))
+    whole = default_solids.complete_solids(jd.Scene(model), jd.pictures.Shapes([box]))
     assert [shape.frame for shape in whole if shape.source == "inertia"] == ["lower"]
 
 
@@ -160,7 +163,7 @@ def test_solids_of_mjcf(tmp_path):
         <geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.05" material="blue"/>
         <geom type="mesh" mesh="part" pos="0.1 0.2 0.3"/><geom type="mesh" mesh="lost" mass="0"/>
         <geom type="sphere" size="0.3" group="3"/></body></worldbody></mujoco>""")
-    with pytest.warns(NotTakenWarning, match=r"lost\.stl"):
+    with pytest.warns(jd.io.NotTakenWarning, match=r"lost\.stl"):
         solids = jd.pictures.shapes(path)
     assert [(shape.frame, shape.kind) for shape in solids] == [(None, "box"), ("arm", "capsule"), ("arm", "mesh")]
     assert volume(*solids[0].triangles()) == pytest.approx(8 * 0.006, rel=1e-12)
@@ -179,7 +182,7 @@ def test_solids_of_sdf(tmp_path):
       <visual name='w'><geometry><sphere><radius>0.5</radius></sphere></geometry></visual>
       <visual name='x'><geometry><cylinder><radius>0.5</radius><length>2</length></cylinder></geometry></visual>
       <visual name='y'><geometry><mesh><uri>model://m/no.dae</uri></mesh></geometry></visual></link></model></sdf>""")
-    with pytest.warns(NotTakenWarning, match=r"model://m/no\.dae"):
+    with pytest.warns(jd.io.NotTakenWarning, match=r"model://m/no\.dae"):
         solids = jd.pictures.shapes(path)
     assert [shape.kind for shape in solids] == ["box", "ellipsoid", "cylinder"]
     assert solids[0].color == (0.2, 0.3, 0.4) and solids[0].opacity == 0.5
@@ -202,7 +205,7 @@ def test_shapes_refuse_what_they_cannot_read(tmp_path):
     path.write_text(
         "<robot name='r'><link name='a'><visual><geometry><mesh filename='broken.stl'/></geometry></visual></link></robot>"
     )
-    with pytest.warns(NotTakenWarning, match=r"broken\.stl"):
+    with pytest.warns(jd.io.NotTakenWarning, match=r"broken\.stl"):
         assert jd.pictures.shapes(path) == ()
 
 
@@ -295,8 +298,8 @@ def test_marks_of_turning_solids_are_their_whole_surface():
     """Painted halves of a ball and of a wheel are equally large, and together the solid."""
     model = jd.scenes.rolling_coin().system
     for kind, size in (("ellipsoid", (0.5,) * 3), ("cylinder", (0.5, 0.1))):
-        solid = Shape("coin", kind, size, source="constraint")
-        dark, light = stage.paint_sectors(Shapes([solid]), model)
+        solid = jd.pictures.Shape("coin", kind, size, source="constraint")
+        dark, light = stage.paint_sectors(jd.pictures.Shapes([solid]), model)
         areas = []
         for part in (dark, light):
             vertices, faces = part.triangles()
@@ -307,7 +310,12 @@ def test_marks_of_turning_solids_are_their_whole_surface():
         assert areas[0] == pytest.approx(areas[1], rel=1e-9)
         assert len(dark.faces) + len(light.faces) == len(solid.triangles()[1])
     # A solid of a file keeps its colours, and a mark of a point is without an attitude.
-    kept = Shapes([Shape("coin", "ellipsoid", (0.5,) * 3), Shape("coin", "ellipsoid", (0.01,) * 3, source="mark")])
+    kept = jd.pictures.Shapes(
+        [
+            jd.pictures.Shape("coin", "ellipsoid", (0.5,) * 3),
+            jd.pictures.Shape("coin", "ellipsoid", (0.01,) * 3, source="mark"),
+        ]
+    )
     assert stage.paint_sectors(kept, model) == kept
 
 
@@ -317,7 +325,7 @@ def test_a_link_with_three_joints_is_a_plate():
     builder = jd.ModelBuilder("links").add_body("link", inertia=(1.0, (0.3, 0.2, 0.0), (0.1, 0.1, 0.2)))
     for name, place in zip("ab", corners[1:], strict=True):
         builder.add_body(name, "link", inertia=(1.0, (0.2, 0.0, 0.0), (0.1, 0.1, 0.1)), pose=tuple(place))
-    solids = default_solids.complete_solids(jd.Scene(builder.build()), Shapes())
+    solids = default_solids.complete_solids(jd.Scene(builder.build()), jd.pictures.Shapes())
     (plate,) = [solid for solid in solids if solid.frame == "link" and solid.kind == "mesh"]
     vertices, faces = plate.triangles()
     assert volume(vertices, faces) == pytest.approx(0.25 * np.ptp(vertices[:, 2]), rel=1e-9)
@@ -378,7 +386,9 @@ def test_what_a_hand_holds_is_seen_through_and_has_its_shape():
     shapes = {}
     for name, held in (("hand_with_ball", "ball"), ("allegro_with_cube", "cube"), ("hand_with_bar", "bar")):
         shapes[name] = [
-            s for s in default_solids.complete_solids(getattr(jd.scenes, name)(), Shapes()) if s.frame == held
+            s
+            for s in default_solids.complete_solids(getattr(jd.scenes, name)(), jd.pictures.Shapes())
+            if s.frame == held
         ]
     (ball,), (cube,) = shapes["hand_with_ball"], shapes["allegro_with_cube"]
     assert ball.kind == "ellipsoid" and ball.size == pytest.approx((0.1,) * 3) and 0 < ball.opacity < 0.5
@@ -387,7 +397,7 @@ def test_what_a_hand_holds_is_seen_through_and_has_its_shape():
 
 
 def test_triangles_are_cut_and_stay_the_surface():
-    vertices, faces = Shape("b", "box", (1.0, 0.5, 0.1)).triangles()
+    vertices, faces = jd.pictures.Shape("b", "box", (1.0, 0.5, 0.1)).triangles()
     many, cut = refine(vertices, faces, 0.2)
     sides = np.linalg.norm(many[np.roll(cut, -1, 1)] - many[cut], axis=2)
     assert sides.max() <= 0.2 and len(cut) > len(faces)
@@ -420,7 +430,7 @@ def test_draw_and_animate(turning, solids, urdf, tmp_path):
     jd.draw(jd.load_model(urdf), jnp.asarray([0.3, -0.2]), axes, shapes=solids)
 
 
-SQUARE = Shape("elsewhere", "box", (1.0, 1.0, 1.0))
+SQUARE = jd.pictures.Shape("elsewhere", "box", (1.0, 1.0, 1.0))
 # What is wrong, by the words of the error, for a scene, its solution and a folder.
 REFUSED = {
     r"LagrangianSystem, which has no bodies.*jd\.plot\.states": lambda *_: jd.draw(jd.scenes.pendulum(), jnp.zeros(1)),
@@ -590,7 +600,7 @@ def test_bodies_with_a_slash_in_their_names_are_where_they_are(monkeypatch):
 
 def red_box(model):
     """One red box on the model's last body."""
-    return Shapes([Shape(model.body_names[-1], "box", (0.5, 0.5, 0.5), color=(1.0, 0.0, 0.0))])
+    return jd.pictures.Shapes([jd.pictures.Shape(model.body_names[-1], "box", (0.5, 0.5, 0.5), color=(1.0, 0.0, 0.0))])
 
 
 @pytest.mark.long

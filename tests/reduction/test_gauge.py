@@ -8,13 +8,6 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn import scenes
-from jaxdyn.constraints import Pfaffian
-from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, projections
-from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.reduction.minimal import gauge_invariant
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
 
 
 def turned(n, seed=0):
@@ -54,16 +47,20 @@ def admissible(v, A, b=0.0):
 def test_it_equals_the_projection_form(state):
     """Same acceleration and multipliers, the two projections of EQUATIONS section 9, both decoupled equations."""
     q, v, tau = state
-    scene = Scene(LagrangianSystem(coupled, 4), (Pfaffian(two_rows),))
+    scene = jd.Scene(jd.LagrangianSystem(coupled, 4), (jd.Pfaffian(two_rows),))
     v = admissible(v, two_rows(q, jnp.zeros(())))
 
     @quick
     def compute(q, v, tau):
-        lines = gauge_invariant(scene, q, v, tau), constrained_dynamics(scene, q, v, tau), projections(scene, q)
-        return *lines, mass_matrix(scene.system, q)
+        lines = (
+            jd.reduction.gauge_invariant(scene, q, v, tau),
+            jd.constrained_dynamics(scene, q, v, tau),
+            jd.constraints.projections(scene, q),
+        )
+        return *lines, jd.mass_matrix(scene.system, q)
 
     x, want, (P_T, P_omega), M = compute(q, v, tau)
-    assert bool(x.result == RESULTS.successful)
+    assert bool(x.result == jd.RESULTS.successful)
     assert_close(x.acceleration, want.acceleration, 1e-12)
     assert_close(x.multipliers, want.multipliers, 1e-12)
     assert_close(x.W @ x.W.T, M, 1e-14)
@@ -86,11 +83,11 @@ def test_rates_are_those_along_the_motion(state):
     V2 is carried in parallel: the rate of V2^T w is V2^T times that of w, less V2^T V1dot V1^T w.
     """
     q, v, tau = state
-    scene = Scene(LagrangianSystem(coupled, 4), (Pfaffian(two_rows, slip),))
+    scene = jd.Scene(jd.LagrangianSystem(coupled, 4), (jd.Pfaffian(two_rows, slip),))
     t = jnp.asarray(0.4)
     v = admissible(v, two_rows(q, t), slip(q, t))
-    f = quick(lambda q, v, t: gauge_invariant(scene, q, v, tau, t))
-    x, want = f(q, v, t), quick(lambda q, v, t: constrained_dynamics(scene, q, v, tau, t))(q, v, t)
+    f = quick(lambda q, v, t: jd.reduction.gauge_invariant(scene, q, v, tau, t))
+    x, want = f(q, v, t), quick(lambda q, v, t: jd.constrained_dynamics(scene, q, v, tau, t))(q, v, t)
     assert_close(x.acceleration, want.acceleration, 1e-12)
     assert_close(x.multipliers, want.multipliers, 1e-12)
     h = 1e-3
@@ -115,10 +112,10 @@ def test_rates_are_those_along_the_motion(state):
 def test_the_motion_does_not_depend_on_the_gauge(state):
     """W -> W Q and V2 -> V2 R: accelerations and multipliers stay, w and w_r turn, Gamma and Gamma_r are conjugated."""
     q, v, tau = state
-    scene = Scene(LagrangianSystem(coupled, 4), (Pfaffian(two_rows),))
+    scene = jd.Scene(jd.LagrangianSystem(coupled, 4), (jd.Pfaffian(two_rows),))
     v = admissible(v, two_rows(q, jnp.zeros(())))
     Q, R = turned(4, 1), turned(2, 2)
-    solve = quick(lambda Q, R: gauge_invariant(scene, q, v, tau, rotation=Q, motion_rotation=R))
+    solve = quick(lambda Q, R: jd.reduction.gauge_invariant(scene, q, v, tau, rotation=Q, motion_rotation=R))
     x, y, z = solve(jnp.eye(4), jnp.eye(2)), solve(Q, jnp.eye(2)), solve(jnp.eye(4), R)
     for other in (y, z):
         assert_close(other.acceleration, x.acceleration, 1e-12)
@@ -141,39 +138,42 @@ def test_the_motion_does_not_depend_on_the_gauge(state):
 def test_bodies_with_dependent_rows():
     """A pendulum with its rod listed three times; the sleigh, a body whose velocity is not dq/dt. Eager calls."""
     scene, (q, v) = scenes.spherical_pendulum(), scenes.spherical_pendulum.start()
-    scene = Scene(scene.system, scene.constraints * 3)
-    computed, want = gauge_invariant(scene, q, v), quick(lambda q, v: constrained_dynamics(scene, q, v))(q, v)
-    assert computed.V2.shape == (3, 2) and bool(computed.result == RESULTS.successful)
+    scene = jd.Scene(scene.system, scene.constraints * 3)
+    computed, want = (
+        jd.reduction.gauge_invariant(scene, q, v),
+        quick(lambda q, v: jd.constrained_dynamics(scene, q, v))(q, v),
+    )
+    assert computed.V2.shape == (3, 2) and bool(computed.result == jd.RESULTS.successful)
     assert_close(computed.acceleration, want.acceleration, 1e-10)
     assert_close(computed.multipliers, want.multipliers, 1e-10)
-    wrong = quick(lambda q, v: gauge_invariant(scene, q, v, dof=1).result == RESULTS.singular_basis)
+    wrong = quick(lambda q, v: jd.reduction.gauge_invariant(scene, q, v, dof=1).result == jd.RESULTS.singular_basis)
     assert bool(wrong(q, v))
     with pytest.raises(ValueError, match=r"3 constraint rows leave no degree of freedom of nv = 3: .* give dof"):
-        jax.jit(lambda q, v: gauge_invariant(scene, q, v))(q, v)
+        jax.jit(lambda q, v: jd.reduction.gauge_invariant(scene, q, v))(q, v)
     with pytest.raises(ValueError, match=r"rotation has shape \(2, 2\), expected \(3, 3\)"):
-        gauge_invariant(scene, q, v, rotation=jnp.eye(2), dof=1)
+        jd.reduction.gauge_invariant(scene, q, v, rotation=jnp.eye(2), dof=1)
     sleigh, (q, v) = scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start()
-    computed = gauge_invariant(sleigh, q, v)
+    computed = jd.reduction.gauge_invariant(sleigh, q, v)
     a, m, moment = 0.3, 1.0, 0.5
     want = [a * v[2] ** 2, 0.0, -m * a * v[0] * v[2] / (moment + m * a**2)]
     assert_close(computed.acceleration, want, 1e-12)
-    assert_close(computed.Lambda @ computed.W.T, constraint_jacobian(sleigh, q), 1e-13)
+    assert_close(computed.Lambda @ computed.W.T, jd.constraint_jacobian(sleigh, q), 1e-13)
 
 
 @pytest.mark.long
 def test_derivatives_and_float32(state):
     """The acceleration's Jacobian equals that of the projection form, also at rest; float32 keeps its type."""
     q, _, tau = state
-    scene = Scene(LagrangianSystem(coupled, 4), (Pfaffian(two_rows),))
-    one = lambda x: gauge_invariant(scene, x[:4], x[4:], tau).acceleration  # noqa: E731
-    other = lambda x: constrained_dynamics(scene, x[:4], x[4:], tau).acceleration  # noqa: E731
+    scene = jd.Scene(jd.LagrangianSystem(coupled, 4), (jd.Pfaffian(two_rows),))
+    one = lambda x: jd.reduction.gauge_invariant(scene, x[:4], x[4:], tau).acceleration  # noqa: E731
+    other = lambda x: jd.constrained_dynamics(scene, x[:4], x[4:], tau).acceleration  # noqa: E731
     slopes = quick(lambda x: (jax.jacrev(one)(x), jax.jacfwd(other)(x)))(jnp.concatenate([q, 0 * q]))
     assert_close(*slopes, 1e-10)
     disk, (q, v) = scenes.rolling_disk(), scenes.rolling_disk.start(heading=0.3)
     low = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, (disk, q, v))
-    computed = quick(gauge_invariant)(*low)
+    computed = quick(jd.reduction.gauge_invariant)(*low)
     assert computed.acceleration.dtype == computed.Gamma_r.dtype == jnp.float32
-    exact = quick(lambda q, v: constrained_dynamics(disk, q, v).acceleration)(q, v)
+    exact = quick(lambda q, v: jd.constrained_dynamics(disk, q, v).acceleration)(q, v)
     np.testing.assert_allclose(computed.acceleration, exact, atol=1e-5)
 
 

@@ -8,33 +8,30 @@ from linearisation import admissible
 from mechanisms import delta, delta_hips, stewart
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import scenes
-from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.base import constraint_jacobian, velocity_residual
-from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.dynamics.quantities import forward_dynamics, inverse_dynamics
-from jaxdyn.forces.elements import JointDamping, JointSpring
-from jaxdyn.model import robots
+from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.model.topology import velocity_indices
-from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics
-from jaxdyn.systems.scene import Scene
 
 
 def four_bar():
     scene = scenes.four_bar()
-    scene = Scene(scene.system, scene.constraints, (JointDamping(0.3), JointSpring(jnp.array([1.0, 0.0, 2.0]))))
+    scene = jd.Scene(
+        scene.system,
+        scene.constraints,
+        (jd.forces.JointDamping(0.3), jd.forces.JointSpring(jnp.array([1.0, 0.0, 2.0]))),
+    )
     return scene, scenes.four_bar.start()[0], ["1"], None
 
 
 def platform():
     scene, q = stewart()
-    return scene, assemble(scene, q).q, [f"leg{i}" for i in range(6)], None
+    return scene, jd.assemble(scene, q).q, [f"leg{i}" for i in range(6)], None
 
 
 def delta_robot():
     scene, q = delta()
-    return scene, assemble(scene, q, hold={"x": 0.05, "y": -0.03}).q, [f"hip{i}" for i in range(3)], None
+    return scene, jd.assemble(scene, q, hold={"x": 0.05, "y": -0.03}).q, [f"hip{i}" for i in range(3)], None
 
 
 def redundant():
@@ -64,7 +61,10 @@ CASES = [four_bar, platform, delta_robot, redundant, overconstrained, rolling]
 @pytest.mark.long
 @pytest.mark.parametrize(
     "case",
-    [pytest.param(case, marks=pytest.mark.slow if case is platform else (), id=case.__name__) for case in CASES],
+    [
+        pytest.param(case, marks=pytest.mark.slow if case in (platform, delta_robot) else (), id=case.__name__)
+        for case in CASES
+    ],
 )
 def test_inverse_of_constrained_dynamics(case):
     """The torques give back the acceleration and the multipliers, which satisfy the equations of motion."""
@@ -75,16 +75,16 @@ def test_inverse_of_constrained_dynamics(case):
 
     @quick
     def compute(scene, q, speed, rate):
-        inverse = constrained_inverse_dynamics(scene, q, speed, rate, motors=motors, independent=independent)
+        inverse = jd.constrained_inverse_dynamics(scene, q, speed, rate, motors=motors, independent=independent)
         v = inverse.velocity
-        forward = constrained_dynamics(scene, q, v, inverse.tau)
+        forward = jd.constrained_dynamics(scene, q, v, inverse.tau)
         force = scene.applied_force(q, v)
-        left = inverse_dynamics(scene.system, q, v, inverse.acceleration) - (0 if force is None else force)
-        left = left - constraint_jacobian(scene, q).T @ inverse.multipliers - inverse.tau
+        left = jd.inverse_dynamics(scene.system, q, v, inverse.acceleration) - (0 if force is None else force)
+        left = left - jd.constraint_jacobian(scene, q).T @ inverse.multipliers - inverse.tau
         return inverse, forward, velocity_residual(scene, q, v), left
 
     inverse, forward, slip, left = compute(scene, q, speed, rate)
-    assert inverse.result == RESULTS.successful
+    assert inverse.result == jd.RESULTS.successful
     size = float(jnp.max(jnp.abs(inverse.tau)))
     places = list(velocity_indices(scene.system, motors)) if isinstance(motors[0], str) else motors
     chosen = places if independent is None else independent
@@ -102,19 +102,19 @@ def test_torques_of_a_delta_robot_are_those_of_virtual_work():
     """J^T tau = power of gravity and inertia, by differences of the closed form of the hips along a straight path."""
     scene, guess = delta()
     point, velocity = jnp.array([0.05, -0.03, -0.65]), jnp.array([0.3, 0.2, -0.1])
-    q = assemble(scene, guess, hold=dict(zip("xyz", np.asarray(point), strict=True))).q
+    q = jd.assemble(scene, guess, hold=dict(zip("xyz", np.asarray(point), strict=True))).q
     names = [f"hip{i}" for i in range(3)]
     hips = np.asarray(q)[velocity_indices(scene.system, names)]
     np.testing.assert_allclose(hips, delta_hips(point), atol=1e-12)
     path = lambda s: delta_hips(point + s * velocity)  # noqa: E731
     rate = jax.jacfwd(path)
     speed, acceleration = rate(0.0), jax.jacfwd(rate)(0.0)
-    inverse = constrained_inverse_dynamics(scene, q, speed, acceleration, motors=names)
+    inverse = jd.constrained_inverse_dynamics(scene, q, speed, acceleration, motors=names)
     place = jnp.asarray(velocity_indices(scene.system, list("xyz")))
     assert_close(inverse.velocity[place], velocity, 1e-10)
     np.testing.assert_allclose(inverse.acceleration[place], 0.0, atol=1e-10)
     # For any admissible velocity u: u . tau = u . (M a + h), by the Jacobian of the closed form.
-    left = inverse_dynamics(scene.system, q, inverse.velocity, inverse.acceleration)
+    left = jd.inverse_dynamics(scene.system, q, inverse.velocity, inverse.acceleration)
     for u in np.eye(3):
         whole = admissible(scene, q, place, jnp.asarray(u))
         along = jax.jvp(delta_hips, (point,), (jnp.asarray(u),))[1]
@@ -127,19 +127,19 @@ def test_more_motors_than_degrees_of_freedom():
     scene, q, motors, independent = redundant()
     rate, weights = jnp.array([0.4, -0.7]), np.array([1.0, 3.0, 0.5])
     given = {"motors": motors, "independent": independent}
-    inverse = constrained_inverse_dynamics(scene, q, [0.2, 0.5], rate, **given, weights=weights)
-    left = np.asarray(inverse_dynamics(scene.system, q, inverse.velocity, inverse.acceleration))
-    N = np.linalg.svd(np.asarray(constraint_jacobian(scene, q)))[2][4:].T
+    inverse = jd.constrained_inverse_dynamics(scene, q, [0.2, 0.5], rate, **given, weights=weights)
+    left = np.asarray(jd.inverse_dynamics(scene.system, q, inverse.velocity, inverse.acceleration))
+    N = np.linalg.svd(np.asarray(jd.constraint_jacobian(scene, q)))[2][4:].T
     B = N.T @ np.eye(6)[:, motors]
     W = np.diag(1 / weights)
     want = W @ B.T @ np.linalg.solve(B @ W @ B.T, N.T @ left)
     assert_close(inverse.torques, want, 1e-11)
     # The values of all three motors, which agree with one motion, and the matrix of the motors, give the same.
-    plain = constrained_inverse_dynamics(scene, q, inverse.velocity, rate, **given)
-    every = constrained_inverse_dynamics(
+    plain = jd.constrained_inverse_dynamics(scene, q, inverse.velocity, rate, **given)
+    every = jd.constrained_inverse_dynamics(
         scene, q, inverse.velocity, plain.acceleration[jnp.array(motors)], motors=motors
     )
-    by_matrix = constrained_inverse_dynamics(
+    by_matrix = jd.constrained_inverse_dynamics(
         scene, q, inverse.velocity, rate, motors=np.eye(6)[:, motors], independent=independent
     )
     for other in (every, by_matrix):
@@ -148,11 +148,11 @@ def test_more_motors_than_degrees_of_freedom():
 
 
 def test_without_constraints_it_is_inverse_dynamics():
-    model = robots.iiwa()
+    model = jd.robots.iiwa()
     rng = np.random.default_rng(5)
     q, v, a = jnp.asarray(rng.normal(size=(3, 7)))
-    inverse = constrained_inverse_dynamics(model, q, v, a)
-    assert_close(inverse.torques, inverse_dynamics(model, q, v, a), 1e-12)
+    inverse = jd.constrained_inverse_dynamics(model, q, v, a)
+    assert_close(inverse.torques, jd.inverse_dynamics(model, q, v, a), 1e-12)
     assert inverse.multipliers.shape == (0,) and inverse.q_dot.shape == (7,)
 
 
@@ -164,7 +164,7 @@ def test_derivatives_and_batches():
     def torques(mass, angle, rate):
         scene = scenes.parallel_manipulator(mass=mass, gravity=(0.0, -9.81, 0.0))
         q, v = scenes.parallel_manipulator.start(point=jnp.stack([angle, 0.05]), velocity=(0.3, -0.2))
-        return constrained_inverse_dynamics(scene, q, v, rate, motors=motors, independent=independent).torques
+        return jd.constrained_inverse_dynamics(scene, q, v, rate, motors=motors, independent=independent).torques
 
     x = jnp.array(1.3), jnp.array(0.1), jnp.array([0.4, -0.7])
     forward = quick(jax.jacfwd(torques, (0, 1, 2)))(*x)
@@ -186,10 +186,10 @@ def test_derivatives_and_batches():
 def test_refusals_and_codes():
     scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
     model = scene.system
-    solve = constrained_inverse_dynamics
+    solve = jd.constrained_inverse_dynamics
     with pytest.raises(ValueError, match=r"joint 'crank' is not in model"):
         solve(scene, q, v, [0.0], motors=["crank"])
-    with pytest.raises(ValueError, match=r"motors is \[0, 0\]; give names of joints or different indices"):
+    with pytest.raises(ValueError, match=r"motors is \[0, 0\]"):
         solve(scene, q, v, [0.0, 0.0], motors=[0, 0])
     with pytest.raises(ValueError, match=r"a_independent has shape \(2,\), expected \(1,\)"):
         solve(scene, q, v, [0.0, 1.0], motors=[0])
@@ -197,23 +197,23 @@ def test_refusals_and_codes():
         ValueError, match=r"v has shape \(2,\), expected \(3,\) or \(1,\), all velocities or the independent ones"
     ):
         solve(scene, q, v[:2], [0.0], motors=[0])
-    with pytest.raises(ValueError, match=r"weights is \[-1.\]; give positive numbers"):
+    with pytest.raises(ValueError, match=r"weights is \[-1.\]"):
         solve(scene, q, v, [0.0], motors=[0], weights=[-1.0])
-    with pytest.raises(ValueError, match="names no velocities; give independent"):
+    with pytest.raises(ValueError, match="names no velocities"):
         solve(scene, q, v, [0.0], motors=np.eye(3)[:, :1])
     with pytest.raises(ValueError, match="motors: they cannot produce this motion"):
-        solve(Scene(model), q, v, jnp.ones(3), motors=[0], independent=[0, 1, 2])
+        solve(jd.Scene(model), q, v, jnp.ones(3), motors=[0], independent=[0, 1, 2])
     with pytest.raises(ValueError, match="no motion has the values given"):
         solve(scene, q, v, jnp.ones(3))
     # A dead centre: the rocker does not determine the crank where crank and coupler are in one line.
-    dead = assemble(scene, jnp.array([0.9, 0.0, 2.0]), hold={"2": 0.0}).q
+    dead = jd.assemble(scene, jnp.array([0.9, 0.0, 2.0]), hold={"2": 0.0}).q
     with pytest.raises(ValueError, match=r"no motion has the values given for the velocities \[2\]"):
         solve(scene, dead, jnp.zeros(3), [1.0], motors=["3"])
     with pytest.raises(ValueError, match=r"the velocities \[2\] do not determine the others"):
         solve(scene, dead, [0.0], [0.0], motors=["3"])
-    codes = quick(lambda a: solve(Scene(model), q, v, a, motors=[0], independent=[0, 1, 2]).result)(jnp.ones(3))
-    assert codes == RESULTS.underactuated
-    assert solve(scene, dead, jnp.zeros(3), [1.0], motors=["3"], throw=False).result == RESULTS.contradictory_rows
+    codes = quick(lambda a: solve(jd.Scene(model), q, v, a, motors=[0], independent=[0, 1, 2]).result)(jnp.ones(3))
+    assert codes == jd.RESULTS.underactuated
+    assert solve(scene, dead, jnp.zeros(3), [1.0], motors=["3"], throw=False).result == jd.RESULTS.contradictory_rows
 
 
 @pytest.mark.long
@@ -222,27 +222,25 @@ def test_small_motions_are_judged_by_their_size():
     scene, (q, v) = scenes.four_bar(gravity=None), scenes.four_bar.start()
     still, ratio = jnp.zeros(3), v[2] / v[0]
     solve = quick(
-        lambda rate: constrained_inverse_dynamics(scene, q, still, rate, motors=["1"], independent=["1", "3"]).result
+        lambda rate: jd.constrained_inverse_dynamics(scene, q, still, rate, motors=["1"], independent=["1", "3"]).result
     )
     for size in (1.0, 1e-6, 1e-12):
-        assert solve(size * jnp.stack([1.0, ratio])) == RESULTS.successful
-        assert solve(size * jnp.stack([1.0, ratio + 1e-6])) == RESULTS.contradictory_rows
+        assert solve(size * jnp.stack([1.0, ratio])) == jd.RESULTS.successful
+        assert solve(size * jnp.stack([1.0, ratio + 1e-6])) == jd.RESULTS.contradictory_rows
 
 
 def test_all_velocities_have_one_order():
-    model = robots.chain(2)
+    model = jd.robots.chain(2)
     q, v, a = jnp.array([0.4, -0.7]), jnp.array([0.3, 0.5]), jnp.array([1.0, 2.0])
-    with pytest.raises(
-        ValueError, match=r"motors has all velocities, in the order \[1, 0\]; name them in the order of the model"
-    ):
-        constrained_inverse_dynamics(model, q, v, a, motors=model.joint_names[::-1])
+    with pytest.raises(ValueError, match=r"motors has all velocities, in the order \[1, 0\]"):
+        jd.constrained_inverse_dynamics(model, q, v, a, motors=model.joint_names[::-1])
 
 
 def test_velocities_that_nothing_drives_move_as_forces_make_them():
     """An acrobot whose elbow alone is driven: the acceleration of the other joint is that of forward dynamics."""
-    model = robots.chain(2)
+    model = jd.robots.chain(2)
     q, v = jnp.array([0.4, -0.7]), jnp.array([0.3, 0.5])
-    inverse = constrained_inverse_dynamics(model, q, v, [1.5], motors=[1])
-    assert_close(forward_dynamics(model, q, v, inverse.tau), inverse.acceleration, 1e-12)
+    inverse = jd.constrained_inverse_dynamics(model, q, v, [1.5], motors=[1])
+    assert_close(jd.forward_dynamics(model, q, v, inverse.tau), inverse.acceleration, 1e-12)
     assert_close(inverse.acceleration[1], 1.5, 1e-12)
     assert float(inverse.tau[0]) == 0.0

@@ -9,23 +9,10 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.compile import kernels
-from jaxdyn.constraints import Pfaffian
-from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
-from jaxdyn.dynamics.kinematics import forward_kinematics
-from jaxdyn.dynamics.quantities import bias_force, forward_dynamics, mass_matrix
-from jaxdyn.forces.elements import JointDamping
-from jaxdyn.model import robots
-from jaxdyn.model.configuration import configuration_rate
-from jaxdyn.reduction.bases import as_basis, independent_velocities, tangent_basis
-from jaxdyn.reduction.minimal import reduced_dynamics
-from jaxdyn.simulation.methods import Baumgarte, Reduced
-from jaxdyn.simulation.options import Steps
-from jaxdyn.simulation.run import simulate
-from jaxdyn.simulation.solution import RESULTS as SIMULATION
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
+from jaxdyn.reduction.bases import as_basis, independent_velocities
 
 RHO = 0.5
 
@@ -39,7 +26,7 @@ def disk_basis(q, t):
 
 def body_twists(model, q, v):
     """Body twists (nb, 6), by differentiating the poses along the motion."""
-    pose, rate = jax.jvp(lambda q: forward_kinematics(model, q), (q,), (configuration_rate(model, q, v),))
+    pose, rate = jax.jvp(lambda q: jd.forward_kinematics(model, q), (q,), (jd.configuration_rate(model, q, v),))
     hat = jnp.linalg.inv(pose) @ rate
     return jnp.stack([hat[:, 0, 3], hat[:, 1, 3], hat[:, 2, 3], hat[:, 2, 1], hat[:, 0, 2], hat[:, 1, 0]], 1)
 
@@ -56,8 +43,8 @@ def kane(scene, q, nu, tau, basis):
     def twists(q, nu, nu_rate):
         f = lambda q, t, nu: body_twists(model, q, motion(q, t, nu))  # noqa: E731
         v, t = motion(q, jnp.zeros(()), nu), jnp.zeros(())
-        V, A = jax.jvp(f, (q, t, nu), (configuration_rate(model, q, v), jnp.ones(()), nu_rate))
-        return V, A, v, forward_kinematics(model, q)[:, :3, :3]
+        V, A = jax.jvp(f, (q, t, nu), (jd.configuration_rate(model, q, v), jnp.ones(()), nu_rate))
+        return V, A, v, jd.forward_kinematics(model, q)[:, :3, :3]
 
     nu, units = np.asarray(nu), np.eye(len(nu))
     V, A, v, rotations = (np.asarray(x) for x in twists(q, nu, 0 * nu))
@@ -97,19 +84,19 @@ def test_reduced_equations_are_those_of_kane(name, kept):
     family = getattr(scenes, name)
     scene, (q, v) = family(), family.start()
     tau = jnp.asarray(np.random.default_rng(1).normal(size=scene.nv))
-    basis = kept if name == "four_bar" else tangent_basis(scene, q)
+    basis = kept if name == "four_bar" else jd.reduction.tangent_basis(scene, q)
 
     @quick
     def compute(q, v, tau):
         place = as_basis(basis, scene).at(scene, q, jnp.zeros(()))
         nu = jnp.linalg.lstsq(place.N, v - place.v0)[0]
-        reduced = reduced_dynamics(scene, q, nu, tau, basis=basis)
-        return nu, reduced, constrained_dynamics(scene, q, v, tau).acceleration
+        reduced = jd.reduced_dynamics(scene, q, nu, tau, basis=basis)
+        return nu, reduced, jd.constrained_dynamics(scene, q, v, tau).acceleration
 
     nu, reduced, a = compute(q, v, tau)
     mass, bias, force = kane(scene, q, nu, tau, basis)
     assert nu.shape == (len(kept),)
-    assert bool(reduced.result == RESULTS.successful)
+    assert bool(reduced.result == jd.RESULTS.successful)
     assert_close(reduced.mass_matrix, mass, 1e-11)
     assert_close(reduced.bias_force, bias, 1e-11)
     assert_close(reduced.force, force, 1e-11)
@@ -127,7 +114,7 @@ def test_rolling_disk_in_two_velocities():
     push = [0.3, 0.9 + RHO * (0.2 * c - 0.4 * s)]
     rate = np.array(push) / [steer, roll + m * RHO**2]
     forward = RHO * np.array([rate[1] * c - 1.3 * 2.0 * s, rate[1] * s + 1.3 * 2.0 * c])
-    solve = quick(lambda q, nu, tau: [reduced_dynamics(scene, q, nu, tau, basis=b) for b in ((2, 3), disk_basis)])
+    solve = quick(lambda q, nu, tau: [jd.reduced_dynamics(scene, q, nu, tau, basis=b) for b in ((2, 3), disk_basis)])
     for computed in solve(q, nu, tau):
         assert_close(computed.mass_matrix, np.diag([steer, roll + m * RHO**2]), 1e-14)
         np.testing.assert_allclose(computed.bias_force, 0, atol=1e-14)
@@ -155,23 +142,23 @@ def test_constraints_that_move_with_a_prescribed_slip():
         N = jnp.stack([jnp.stack([-a[1] / a[0], one, zero]), jnp.stack([-a[2] / a[0], zero, one])], 1)
         return N, jnp.stack([b / a[0], zero, zero])
 
-    scene = Scene(LagrangianSystem(lagrangian, 3), (Pfaffian(row, slip, name="slip"),))
+    scene = jd.Scene(jd.LagrangianSystem(lagrangian, 3), (jd.Pfaffian(row, slip, name="slip"),))
     q, t = jnp.asarray([0.4, -0.3, 0.8]), jnp.asarray(0.7)
     tau, nu = jnp.asarray([0.1, 0.5, -0.2]), jnp.asarray([0.6, -0.9])
 
     @quick
     def compute(q, nu, tau, t):
-        one = reduced_dynamics(scene, q, nu, tau, t, basis=(1, 2))
-        other = reduced_dynamics(scene, q, nu, tau, t, basis=basis)
+        one = jd.reduced_dynamics(scene, q, nu, tau, t, basis=(1, 2))
+        other = jd.reduced_dynamics(scene, q, nu, tau, t, basis=basis)
         near = as_basis(jnp.eye(3)[:, 1:], scene)
         place = near.at(scene, q, t)
         own = place.N.T @ (one.velocity - place.v0)
-        last = reduced_dynamics(scene, q, own, tau, t, basis=near)
-        return one, other, last, constrained_dynamics(scene, q, one.velocity, tau, t).acceleration
+        last = jd.reduced_dynamics(scene, q, own, tau, t, basis=near)
+        return one, other, last, jd.constrained_dynamics(scene, q, one.velocity, tau, t).acceleration
 
     *computed, a = compute(q, nu, tau, t)
     for reduced in computed:
-        assert bool(reduced.result == RESULTS.successful)
+        assert bool(reduced.result == jd.RESULTS.successful)
         np.testing.assert_allclose(row(q, t) @ reduced.velocity, slip(q, t), rtol=1e-12)
         assert_close(reduced.acceleration, a, 1e-12)
     assert_close(computed[1].nu_rate, computed[0].nu_rate, 1e-12)
@@ -181,7 +168,7 @@ def test_orthonormal_basis_is_smooth_and_can_be_continued():
     """Along a turn of the disk: orthonormal, tangent, differentiable; a new reference does not change N; no jumps."""
     scene = scenes.rolling_disk(radius=2.0)  # a fixed reference becomes singular half a turn away
     place = lambda angle: jnp.asarray([0.1, -0.2, 0.0, 0.3]).at[2].set(angle)  # noqa: E731
-    start = tangent_basis(scene, place(0.0))
+    start = jd.reduction.tangent_basis(scene, place(0.0))
 
     @quick
     def at(angle, reference):
@@ -215,26 +202,28 @@ def test_a_singular_choice_is_reported():
     """Where the pendulum is level, x does not determine y; a traced place gets the code, a concrete one the fix."""
     scene, level = scenes.pendulum_in_plane(), jnp.asarray([1.0, 0.0])
     codes = quick(
-        jax.vmap(lambda q: reduced_dynamics(scene, q, jnp.ones(1), basis=(0,)).result == RESULTS.singular_basis)
+        jax.vmap(lambda q: jd.reduced_dynamics(scene, q, jnp.ones(1), basis=(0,)).result == jd.RESULTS.singular_basis)
     )
     assert codes(jnp.stack([jnp.asarray([0.6, -0.8]), level])).tolist() == [False, True]
     with pytest.raises(ValueError, match=r"basis is not valid at this q: choose other .*, here \(1,\) of 2"):
-        reduced_dynamics(scene, level, jnp.ones(1), basis=(0,))
+        jd.reduced_dynamics(scene, level, jnp.ones(1), basis=(0,))
     # The same row twice; lam = -(m/l^2)(|v|^2 - g y) gives the motion of EQUATIONS section 6.
-    twice = Scene(scene.system, scene.constraints * 2)
+    twice = jd.Scene(scene.system, scene.constraints * 2)
     q = jnp.asarray([0.6, -0.8])
-    for basis, nu in (((0,), 1.2), (tangent_basis(twice, q, dof=1), 1.5)):
-        dynamics = quick(lambda q, nu, basis=basis: reduced_dynamics(twice, q, nu, basis=basis))(q, jnp.asarray([nu]))
+    for basis, nu in (((0,), 1.2), (jd.reduction.tangent_basis(twice, q, dof=1), 1.5)):
+        dynamics = quick(lambda q, nu, basis=basis: jd.reduced_dynamics(twice, q, nu, basis=basis))(
+            q, jnp.asarray([nu])
+        )
         speed = dynamics.velocity @ dynamics.velocity
         assert_close(dynamics.acceleration, jnp.asarray([0.0, -9.81]) - (speed + 9.81 * 0.8) * q, 1e-12)
         assert_close(speed, 1.5**2, 1e-12)
     disk, (q, v) = scenes.rolling_disk(), scenes.rolling_disk.start()
     with pytest.raises(ValueError, match=r"return 2 independent columns .* \(rank 1 of 2, largest"):
-        reduced_dynamics(disk, q, v[2:], basis=lambda q, t: disk_basis(q, t)[:, :1] * jnp.ones((1, 2)))
+        jd.reduced_dynamics(disk, q, v[2:], basis=lambda q, t: disk_basis(q, t)[:, :1] * jnp.ones((1, 2)))
     with pytest.raises(ValueError, match=r"\(rank 2 of 2, largest \|A N\| 0.5\)"):
-        reduced_dynamics(disk, q, v[2:], basis=lambda q, t: 2 * disk_basis(q, t) - jnp.eye(4)[:, 2:])
+        jd.reduced_dynamics(disk, q, v[2:], basis=lambda q, t: 2 * disk_basis(q, t) - jnp.eye(4)[:, 2:])
     with pytest.raises(ValueError, match=r"return 2 independent columns .* \(rank 1 of 1, largest \|A N\| 0\)"):
-        reduced_dynamics(disk, q, v[2:3], basis=lambda q, t: disk_basis(q, t)[:, :1])
+        jd.reduced_dynamics(disk, q, v[2:3], basis=lambda q, t: disk_basis(q, t)[:, :1])
     assert independent_velocities(disk, q) in ((1, 2), (2, 3), (0, 2))
 
 
@@ -249,26 +238,26 @@ def test_bad_arguments():
     }
     for basis, message in bad.items():
         with pytest.raises(ValueError, match=message):
-            reduced_dynamics(scene, q, v[2:], basis=basis)
+            jd.reduced_dynamics(scene, q, v[2:], basis=basis)
     with pytest.raises(ValueError, match=r"basis has shape \(3, 2\), expected \(4, nr\)"):
-        reduced_dynamics(scene, q, v[2:], basis=jnp.ones((3, 2)))
+        jd.reduced_dynamics(scene, q, v[2:], basis=jnp.ones((3, 2)))
     with pytest.raises(ValueError, match=r"basis returned shape \(2,\)"):
-        reduced_dynamics(scene, q, v[2:], basis=lambda q, t: q[:2])
+        jd.reduced_dynamics(scene, q, v[2:], basis=lambda q, t: q[:2])
     with pytest.raises(ValueError, match="no constraints"):
-        reduced_dynamics(Scene(scene.system), q, v, basis=(0,))
+        jd.reduced_dynamics(jd.Scene(scene.system), q, v, basis=(0,))
     twice, q = scenes.pendulum_in_plane(), jnp.asarray([0.6, -0.8])
-    twice = Scene(twice.system, twice.constraints * 2)
-    assert tangent_basis(twice, q).shape == (2, 1)
+    twice = jd.Scene(twice.system, twice.constraints * 2)
+    assert jd.reduction.tangent_basis(twice, q).shape == (2, 1)
     with pytest.raises(ValueError, match="give dof"):
-        jax.jit(lambda q: tangent_basis(twice, q))(q)
+        jax.jit(lambda q: jd.reduction.tangent_basis(twice, q))(q)
 
 
 @pytest.mark.slow
 def test_derivatives_at_rest_and_float32():
     """Second derivatives of the reduced equations at rest are finite; float32 keeps its type."""
     scene, (q, v) = scenes.spherical_pendulum(), scenes.spherical_pendulum.start()
-    reference = tangent_basis(scene, q)
-    value = lambda x: jnp.sum(reduced_dynamics(scene, q + x[:3], x[3:], basis=reference).acceleration)  # noqa: E731
+    reference = jd.reduction.tangent_basis(scene, q)
+    value = lambda x: jnp.sum(jd.reduced_dynamics(scene, q + x[:3], x[3:], basis=reference).acceleration)  # noqa: E731
     curve, slope = quick(jax.jacfwd(lambda x: 2 * (jax.grad(value)(x),), has_aux=True))(jnp.zeros(5))
     assert np.isfinite(curve).all()
     assert_close(curve, curve.T, 1e-12)
@@ -278,22 +267,22 @@ def test_derivatives_at_rest_and_float32():
 
     scene, (q, v) = scenes.rolling_disk(), scenes.rolling_disk.start(heading=0.4)
     low = jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, (scene, q, v))
-    for basis in ((2, 3), tangent_basis(scene, q)):
-        dynamics = quick(lambda scene, q, nu, basis=basis: reduced_dynamics(scene, q, nu, basis=basis))(
+    for basis in ((2, 3), jd.reduction.tangent_basis(scene, q)):
+        dynamics = quick(lambda scene, q, nu, basis=basis: jd.reduced_dynamics(scene, q, nu, basis=basis))(
             low[0], low[1], low[2][2:]
         )
         assert dynamics.acceleration.dtype == dynamics.mass_matrix.dtype == jnp.float32
-        assert bool(dynamics.result == RESULTS.successful)
-        exact = constrained_dynamics(scene, q, jnp.asarray(dynamics.velocity, jnp.float64)).acceleration
+        assert bool(dynamics.result == jd.RESULTS.successful)
+        exact = jd.constrained_dynamics(scene, q, jnp.asarray(dynamics.velocity, jnp.float64)).acceleration
         np.testing.assert_allclose(dynamics.acceleration, exact, atol=1e-5)
 
 
-TIGHT = {"stepsize": Steps(rtol=1e-12, atol=1e-12)}
+TIGHT = {"stepsize": jd.simulation.Steps(rtol=1e-12, atol=1e-12)}
 
 
 def moved(scene, state, ts, outputs=("constraint_residual",), **options):
     """Solution from a start, compiled without optimisation."""
-    run = quick(lambda scene, q, v, ts: simulate(scene, q, v, ts, outputs=outputs, **(TIGHT | options)))
+    run = quick(lambda scene, q, v, ts: jd.simulate(scene, q, v, ts, outputs=outputs, **(TIGHT | options)))
     return run(scene, *state, jnp.asarray(ts))
 
 
@@ -310,7 +299,7 @@ def test_rolling_disk_with_torques_full_and_reduced():
     ts = np.linspace(0.0, 5.0, 6)
     wanted = ("multipliers", "acceleration", "constraint_residual")
     full = moved(scene, state, ts, wanted, control=steering)
-    for method in (Reduced((2, 3)), "reduced"):
+    for method in (jd.Reduced((2, 3)), "reduced"):
         computed = moved(scene, state, ts, wanted, control=steering, method=method)
         assert bool(computed.success) and bool(full.success)
         np.testing.assert_allclose(computed.q, full.q, atol=1e-10)
@@ -327,7 +316,7 @@ def test_rolling_disk_with_torques_full_and_reduced():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", [Reduced((0, 2)), pytest.param("reduced", marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize("method", [jd.Reduced((0, 2)), pytest.param("reduced", marks=pytest.mark.slow)], ids=str)
 def test_sleigh_in_minimal_velocities(method):
     """tanh and sech: printed state at t = 10, v = (forward, sideways, yaw rate) with the yaw rate and speed kept."""
     computed = moved(scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start(), [0.0, 10.0], method=method)
@@ -359,7 +348,9 @@ def test_motions_are_one_native_loop(name, monkeypatch):
     """With the default basis, whose rank is decided in every stage. By XLA a step costs ten times as much."""
     monkeypatch.setattr(kernels, "_run_by_jax", None)
     scene, start = getattr(scenes, name)(), getattr(scenes, name).start()
-    motions = [simulate(scene, *start, jnp.linspace(0.0, 0.2, 3), method=method) for method in ("reduced", "projected")]
+    motions = [
+        jd.simulate(scene, *start, jnp.linspace(0.0, 0.2, 3), method=method) for method in ("reduced", "projected")
+    ]
     np.testing.assert_allclose(motions[0].q, motions[1].q, atol=1e-7)
 
 
@@ -372,21 +363,23 @@ def test_a_basis_that_becomes_singular_ends_the_run():
     assert bool(whole.success)
     level = np.interp(0.0, np.asarray(whole.q[:9, 1]), ts[:9])
     for stepsize, late in ((None, 1e-3), (0.01, 0.011)):
-        run = quick(lambda step=stepsize: simulate(scene, *state, jnp.asarray(ts), method=Reduced((0,)), stepsize=step))
+        run = quick(
+            lambda step=stepsize: jd.simulate(scene, *state, jnp.asarray(ts), method=jd.Reduced((0,)), stepsize=step)
+        )
         computed = run()
-        assert bool(computed.result == SIMULATION.singular_basis)
+        assert bool(computed.result == jd.RESULTS.singular_basis)
         assert -5e-3 < float(computed.stats["time_reached"]) - level < late + 5e-3  # `level` is interpolated linearly
         before = ts < level - 0.01
         np.testing.assert_allclose(computed.q[before], whole.q[before], atol=1e-6)
         assert np.isnan(computed.q[ts > level + 0.05]).all()
     with pytest.raises(RuntimeError, match=r"stopped at t = 0\.\d+ s of 1 s. The minimal velocities .* jd.Reduced\(\)"):
-        simulate(scene, *state, ts, method=Reduced((0,)))
+        jd.simulate(scene, *state, ts, method=jd.Reduced((0,)))
     with pytest.raises(
         ValueError, match=r"basis is not regular at q0: choose other independent velocities, here \(1,\)"
     ):
-        simulate(scene, *scenes.pendulum_in_plane.start(), ts, method=Reduced((0,)))
+        jd.simulate(scene, *scenes.pendulum_in_plane.start(), ts, method=jd.Reduced((0,)))
     with pytest.raises(ValueError, match="cannot follow the basis"):
-        simulate(scene, *state, ts, method="reduced", adjoint="backsolve")
+        jd.simulate(scene, *state, ts, method="reduced", adjoint="backsolve")
 
 
 def test_accelerations_of_baumgarte():
@@ -394,7 +387,9 @@ def test_accelerations_of_baumgarte():
     scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(angle=0.4, rate=0.5)
     alpha, beta = 3.0, 5.0
     off, drift = q * 1.01, v + jnp.asarray([0.1, 0.02])
-    a = quick(lambda q, v: Baumgarte(alpha, beta).acceleration(scene, q, v, jnp.zeros(()), None))(off, drift)
+    a = quick(lambda q, v: jd.simulation.Baumgarte(alpha, beta).acceleration(scene, q, v, jnp.zeros(()), None))(
+        off, drift
+    )
     off, drift, a = np.asarray(off), np.asarray(drift), np.asarray(a)
     phi, rate = 0.5 * (off @ off - 1.0), off @ drift
     np.testing.assert_allclose(off @ a + drift @ drift, -2 * alpha * rate - beta**2 * phi, rtol=1e-12)
@@ -404,7 +399,7 @@ def test_accelerations_of_baumgarte():
 def test_baumgarte_pulls_back_but_errs():
     """The residual is between those of the other methods."""
     scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start(angle=0.4, rate=0.5)
-    options = {"stepsize": Steps(rtol=1e-8, atol=1e-8)}
+    options = {"stepsize": jd.simulation.Steps(rtol=1e-8, atol=1e-8)}
     opened, pulled, held = (
         moved(scene, (q, v), [0.0, 5.0], method=method, **options).constraint_residual[-1, 0]
         for method in ("multipliers", "baumgarte", "projected")
@@ -438,13 +433,13 @@ for _ in range(4):
 
 def test_without_constraints_it_is_the_dynamics_of_the_scene():
     """nu = v, N = 1, with the scene's forces."""
-    model = robots.chain(3)
-    scene = Scene(model, forces=(JointDamping(0.3),))
+    model = jd.robots.chain(3)
+    scene = jd.Scene(model, forces=(jd.forces.JointDamping(0.3),))
     q, v, tau = jnp.array([0.4, -0.9, 1.3]), jnp.array([1.1, 0.2, -0.7]), jnp.array([0.5, -0.2, 0.1])
-    dynamics = quick(lambda q, v, tau: reduced_dynamics(scene, q, v, tau))(q, v, tau)
+    dynamics = quick(lambda q, v, tau: jd.reduced_dynamics(scene, q, v, tau))(q, v, tau)
     assert bool(dynamics.success)
-    assert_close(dynamics.mass_matrix, mass_matrix(model, q), 1e-13)
-    assert_close(dynamics.bias_force, bias_force(model, q, v), 1e-12)
-    assert_close(dynamics.acceleration, forward_dynamics(model, q, v, tau - 0.3 * v), 1e-12)
+    assert_close(dynamics.mass_matrix, jd.mass_matrix(model, q), 1e-13)
+    assert_close(dynamics.bias_force, jd.bias_force(model, q, v), 1e-12)
+    assert_close(dynamics.acceleration, jd.forward_dynamics(model, q, v, tau - 0.3 * v), 1e-12)
     assert_close(dynamics.nu_rate, dynamics.acceleration, 1e-13)
     assert_close(dynamics.velocity, v, 1e-15)

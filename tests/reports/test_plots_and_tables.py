@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.io.logs import read_log
 from jaxdyn.model.configuration import columns_of
 
 TS = np.linspace(0.0, 1.0, 6)
@@ -69,7 +68,7 @@ def test_csv_with_names_and_units_is_a_log(arm, tmp_path):
     header = table_of(tmp_path / "motion.csv")[0]
     assert header[:5] == ["t [s]", "q_shoulder [rad]", "q_lift [m]", "v_shoulder [rad/s]", "v_lift [m/s]"]
     assert {"a_lift [m/s^2]", "tau_shoulder [N m]", "tau_lift [N]", "energy [J]", "power [W]"} <= set(header)
-    log = read_log(tmp_path / "motion.csv", joint_names=arm.joint_names)
+    log = jd.read_log(tmp_path / "motion.csv", joint_names=arm.joint_names)
     for ours, theirs in (
         (solution.q, log.q),
         (solution.v, log.v),
@@ -85,7 +84,7 @@ def test_csv_of_joints_with_several_numbers_counts_them(floating, tmp_path):
     solution.to_csv(tmp_path / "motion.csv", floating)
     header = table_of(tmp_path / "motion.csv")[0]
     assert header[1] == "q1 [root.x; m]" and header[8] == "q8 [hip; rad]" and header[9] == "v1 [root.vx; m/s]"
-    log = read_log(tmp_path / "motion.csv")
+    log = jd.read_log(tmp_path / "motion.csv")
     np.testing.assert_array_equal(log.q, solution.q)
     np.testing.assert_array_equal(log.tau, solution.torque)
 
@@ -110,7 +109,7 @@ def test_npz_keeps_shapes_names_and_units(arm, tmp_path):
         assert json.loads(str(file["names"]))["tau"] == ["shoulder", "lift"]
         assert json.loads(str(file["units"]))["v"] == ["rad/s", "m/s"]
         assert json.loads(str(file["units"]))["energy"] == "J"
-    np.testing.assert_array_equal(read_log(tmp_path / "motion.npz").tau, solution.torque)
+    np.testing.assert_array_equal(jd.read_log(tmp_path / "motion.npz").tau, solution.torque)
     both = batch_of(solution, solution)
     both.to_npz(tmp_path / "motions.npz", arm)
     with np.load(tmp_path / "motions.npz") as file:

@@ -25,14 +25,13 @@ import jaxdyn as jd
 from jaxdyn.scale import program
 from jaxdyn.scale import store as stores
 from jaxdyn.scale.program import members
-from jaxdyn.scale.run import Resources
 from jaxdyn.scale.store import lock_store
 
 zarr = pytest.importorskip("zarr", reason="zarr is not installed: the extra scale")
 xarray = pytest.importorskip("xarray", reason="xarray is not installed: the extra scale")
 
-QUIET = {"resources": Resources(progress=False)}
-OF_RESOURCES = [one.name for one in dataclasses.fields(Resources)]
+QUIET = {"resources": jd.scale.Resources(progress=False)}
+OF_RESOURCES = [one.name for one in dataclasses.fields(jd.scale.Resources)]
 
 
 def square(p):
@@ -46,7 +45,9 @@ def drawn(key):
 
 def evaluated(out, samples=23, function=square, parameters=drawn, **options):
     own = {"chunk": 5, "progress": False} | {name: options.pop(name) for name in OF_RESOURCES if name in options}
-    return jd.scale.evaluate(function, parameters, samples=samples, out=out, resources=Resources(**own), **options)
+    return jd.scale.evaluate(
+        function, parameters, samples=samples, out=out, resources=jd.scale.Resources(**own), **options
+    )
 
 
 def files(path):
@@ -96,7 +97,7 @@ def pendulums(tmp_path_factory):
             stepsize=0.01,
             outputs=("energy",),
             units={"damping": "N m s"},
-            resources=Resources(chunk=8, progress=False),
+            resources=jd.scale.Resources(chunk=8, progress=False),
         )
 
     return again(), build, starts, lengths, ts, again
@@ -178,7 +179,7 @@ def test_motions_do_not_depend_on_devices_and_batches(pendulums, tmp_path):
         out=tmp_path / "b.zarr",
         stepsize=0.01,
         outputs=("energy",),
-        resources=Resources(batch_size=5, devices=jax.local_devices()[:1], progress=False),
+        resources=jd.scale.Resources(batch_size=5, devices=jax.local_devices()[:1], progress=False),
     )
     assert_equal(arrays(one_device.out), arrays(run.out))
 
@@ -413,7 +414,7 @@ def test_failures_are_rows_with_codes(tmp_path):
         out=tmp_path / "a.zarr",
         stepsize=0.05,
         reductions={"q": jd.scale.Mean("q")},
-        resources=Resources(chunk=4, progress=False),
+        resources=jd.scale.Resources(chunk=4, progress=False),
     )
     assert run.codes == {"successful": 7, "nonfinite_start": 2} and not run.success
     assert list(run.failed) == [2, 7] and "2 nonfinite_start" in str(run)
@@ -759,7 +760,8 @@ ROTORS = """<robot name="rotors"><link name="base"/>
   <joint name="j" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/><dynamics damping="0.4"/></joint>
   <joint name="k" type="continuous"><parent link="base"/><child link="b"/><axis xyz="0 0 1"/>
     <mimic joint="j" multiplier="-2"/></joint></robot>"""
-SPRING = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="h" axis="0 0 1" ref="0.3" springref="0.3" stiffness="8"/>
+SPRING = """<mujoco><compiler angle="radian"/><worldbody><body>
+  <joint name="h" axis="0 0 1" ref="0.3" springref="0.3" stiffness="8"/>
   <inertial pos="0 0 0" mass="1" diaginertia="2 2 2"/></body></worldbody></mujoco>"""
 
 
@@ -824,7 +826,7 @@ def test_keywords_of_evaluate_and_run(tmp_path):
         rows=["z", "parameter_x"],
         units={"z": "1/m", "x": "m"},
         reductions={"mean": jd.scale.Mean("z")},
-        resources=Resources(batch_size=2, progress=False),
+        resources=jd.scale.Resources(batch_size=2, progress=False),
     )
     table = run.dataset()
     np.testing.assert_allclose(table["z"], 1 / x, rtol=1e-14)
@@ -850,7 +852,7 @@ def test_seed_rows_retries_and_progress_of_runs(tmp_path, capsys, monkeypatch):
         return jd.scale.run(
             model.build(), lambda p: (jnp.zeros(1), p["v"][None]), lambda key: {"v": jax.random.normal(key, ())},
             np.array([0.0, 2.0]), samples=4, out=tmp_path / name, seed=3, rows=["q"],
-            resources=Resources(retries=retries, progress=progress),
+            resources=jd.scale.Resources(retries=retries, progress=progress),
         )  # fmt: skip
 
     run = simulated("a.zarr", progress=True)

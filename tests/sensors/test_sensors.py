@@ -219,11 +219,11 @@ def test_refusals():
         measure(model, [sensors.Imu("hip")], q, v)
     with pytest.raises(ValueError, match="joint 'hip' is not in model"):
         measure(model, [sensors.Encoder("hip")], q, v)
-    with pytest.raises(ValueError, match="constraint 'knee' is not in the scene; its constraints are none"):
+    with pytest.raises(ValueError, match="constraint 'knee' is not in the scene"):
         measure(model, [sensors.ContactForce("knee")], q, v)
     with pytest.raises(ValueError, match="the name 'imu of tip' occurs twice"):
         measure(model, [sensors.Imu("tip"), sensors.Imu("tip")], q, v)
-    with pytest.raises(ValueError, match="sensors is 'imu'; give a list"):
+    with pytest.raises(ValueError, match="sensors is 'imu'"):
         measure(model, "imu", q, v)
     with pytest.raises(ValueError, match="has no bodies for sensors"):
         measure(scenes.double_pendulum(), [sensors.Imu("tip")], jnp.zeros(2), jnp.zeros(2))

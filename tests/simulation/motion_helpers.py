@@ -3,12 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.simulation.options import Steps
+import jaxdyn as jd
 
 
-def within(tolerance) -> Steps:
+def within(tolerance) -> jd.simulation.Steps:
     """Adaptive steps that keep a tolerance."""
-    return Steps(rtol=tolerance, atol=tolerance)
+    return jd.simulation.Steps(rtol=tolerance, atol=tolerance)
 
 
 def central_difference(function, point, step=1e-4):

@@ -227,12 +227,11 @@ RUNS = {
     "diffrax direct": ("direct", {"solver": diffrax.ImplicitEuler(), "tolerance": 1e-3}),
     "limits": ("reverse", {"events": [jd.events.JointLimit()]}),
 }
-SLOW = "backsolve", "diffrax direct"  # as "direct", and as "diffrax"
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in RUNS]
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "diffrax direct" else name for name in RUNS]
 )
 def test_cotangents_of_a_failed_run_are_nan(name):
     """Those of a start of NaN and of too few steps; the others of the batch keep theirs, as does a loss that leaves them out."""

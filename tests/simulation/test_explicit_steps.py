@@ -13,8 +13,6 @@ from benchmarks.report_cases import cases, test_set
 from jaxdyn import scenes
 from jaxdyn.compile import kernels
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.simulation.solvers.steps import LibrarySteps
-from jaxdyn.systems.scene import Scene
 
 pytestmark = pytest.mark.native
 
@@ -45,7 +43,10 @@ def test_steps_are_those_of_diffrax(solver, shape):
             rows.append((y, error, output.evaluate(t0 + 0.3 * (t1 - t0)), output.evaluate(t1)))
         return rows
 
-    ours, theirs = (quick(lambda: two_steps(LibrarySteps(solver, field=field)))(), quick(lambda: two_steps(solver))())
+    ours, theirs = (
+        quick(lambda: two_steps(jd.solvers.LibrarySteps(solver, field=field)))(),
+        quick(lambda: two_steps(solver))(),
+    )
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=0, atol=1e-13), ours, theirs)
 
 
@@ -76,7 +77,7 @@ CASES = {
 def twice(scene):
     """A disk whose rows are written down a second time."""
     (rolling,) = scene.constraints
-    return Scene(scene.system, (rolling, jd.Pfaffian(rolling.A, name="again")))
+    return jd.Scene(scene.system, (rolling, jd.Pfaffian(rolling.A, name="again")))
 
 
 @pytest.mark.long
@@ -157,7 +158,7 @@ def test_motions_are_those_without_kernels(name, options):
 def test_dependent_rows_take_the_careful_way():
     """Two rows that say the same, which kernels do not serve anywhere."""
     once = scenes.pendulum_in_plane()
-    scene = Scene(once.system, (*once.constraints, *once.constraints))
+    scene = jd.Scene(once.system, (*once.constraints, *once.constraints))
     q, v = (jnp.asarray(x) for x in scenes.pendulum_in_plane.start())
 
     def run(scene):

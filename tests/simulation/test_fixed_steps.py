@@ -9,13 +9,12 @@ from mechanisms import slider
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from jaxdyn.simulation.solution import RESULTS
 
 SOLVERS = {"RK4": None, "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8(), "Rodas5P": jd.solvers.Rodas5P()}
 
 
 def codes(result):
-    return np.asarray(result == RESULTS.successful), np.asarray(result == RESULTS.coarse_steps)
+    return np.asarray(result == jd.RESULTS.successful), np.asarray(result == jd.RESULTS.coarse_steps)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -82,8 +81,8 @@ def test_steps_that_are_too_many_for_the_dtype():
         single = jax.tree.map(lambda x: jnp.asarray(x, dtype), model)
         return jd.simulate(single, *start, ts, stepsize=0.001, throw=False).result
 
-    assert run(jnp.float64) == RESULTS.successful
-    assert run(jnp.float32) == RESULTS.coarse_steps
+    assert run(jnp.float64) == jd.RESULTS.successful
+    assert run(jnp.float32) == jd.RESULTS.coarse_steps
 
 
 def test_what_to_do_is_said():

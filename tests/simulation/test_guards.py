@@ -12,8 +12,6 @@ from motion_helpers import within
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from jaxdyn.contact import friction_cone
-from jaxdyn.grasp import contact
 from jaxdyn.simulation.solvers.guards import Point, Search, search_root
 
 TS = np.linspace(0.0, 3.0, 7)
@@ -34,8 +32,10 @@ def cart(**limits):
 def block():
     builder = jd.ModelBuilder("block", gravity=(0.0, -9.81, 0.0))
     builder.add_body("block", None, "planar", jd.inertia.box(2.0, (0.2, 0.1, 0.3)))
-    touch = contact("hard-finger", None, UPRIGHT, object="block", finger_pose=UPRIGHT, in_plane=True, name="table")
-    return jd.Scene(builder.build(), [touch], cones=friction_cone("hard-finger", 0.5, in_plane=True))
+    touch = jd.grasp.contact(
+        "hard-finger", None, UPRIGHT, object="block", finger_pose=UPRIGHT, in_plane=True, name="table"
+    )
+    return jd.Scene(builder.build(), [touch], cones=jd.contact.friction_cone("hard-finger", 0.5, in_plane=True))
 
 
 class Spring(jd.Controller):

@@ -13,20 +13,9 @@ from pinocchio_bridge import ROBOTS, assert_close, quick, to_jaxdyn
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+import jaxdyn as jd
 from jaxdyn import events, scenes
-from jaxdyn.constraints.base import Holonomic
-from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
-from jaxdyn.dynamics.kinematics import frame_pose
-from jaxdyn.dynamics.quantities import forward_dynamics
-from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.configuration import integrate, neutral
-from jaxdyn.simulation import Pose, motion
-from jaxdyn.simulation.options import Steps
-from jaxdyn.simulation.run import simulate
-from jaxdyn.simulation.solution import RESULTS
-from jaxdyn.simulation.solvers import RK4, LibrarySteps, LieGroup, ProjectedSolver
-from jaxdyn.systems.scene import Scene
+from jaxdyn.simulation import motion
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
 SYMMETRIC = np.array([0.4, 0.4, 0.2])
@@ -44,7 +33,7 @@ class Feedback(eqx.Module):
 
 @pytest.fixture(scope="module")
 def pendulum():
-    builder = ModelBuilder("pendulum")
+    builder = jd.ModelBuilder("pendulum")
     builder.add_body("bob", joint="revolute", axis=(0, 1, 0), inertia=(1.0, (0, 0, -1.0), (0, 0, 0)))
     return builder.build()
 
@@ -52,7 +41,7 @@ def pendulum():
 @pytest.fixture(scope="module")
 def leg():
     """A spherical and a revolute joint, so that q is no vector space."""
-    builder = ModelBuilder("leg")
+    builder = jd.ModelBuilder("leg")
     moments = (0.02, 0.03, 0.04)
     builder.add_body("hip", joint="spherical", inertia=(1.0, (0, 0.1, -0.1), moments))
     builder.add_body("knee", "hip", "revolute", axis=(0, 1, 0), inertia=(0.5, (0, 0, -0.2), moments), pose=(0, 0, -0.4))
@@ -80,7 +69,7 @@ def turning(t, y, args):
 
 def test_projected_solver_steps_on_the_manifold_and_evaluates_the_first_stage_anew():
     """The carried stage of a first-same-as-last method belongs to the point before projection and must not be used."""
-    term, solver = diffrax.ODETerm(turning), ProjectedSolver(diffrax.Tsit5(), circle)
+    term, solver = diffrax.ODETerm(turning), jd.solvers.ProjectedSolver(diffrax.Tsit5(), circle)
     y0, h = {"x": jnp.asarray([0.6, 0.8])}, 0.7
 
     @quick
@@ -112,19 +101,19 @@ def test_only_models_with_quaternions_are_retracted(pendulum, leg, monkeypatch):
 
     def made(solver, project, *more, **fields):
         wrapped.extend([] if project is None else [project])
-        return LibrarySteps(solver, project, *more, **fields)
+        return jd.solvers.LibrarySteps(solver, project, *more, **fields)
 
     monkeypatch.setattr(motion, "LibrarySteps", made)
     for model, size in ((pendulum, 0), (leg, 1)):
-        q0, v0 = neutral(model), jnp.zeros(model.nv)
-        jax.make_jaxpr(lambda q, v, model=model: simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)
+        q0, v0 = jd.neutral(model), jnp.zeros(model.nv)
+        jax.make_jaxpr(lambda q, v, model=model: jd.simulate(model, q, v, [0.0, 1.0], stepsize=0.1).q)(q0, v0)
         assert len(wrapped) == size
 
 
 # Steps whose errors lie between rounding and the first terms of the expansion.
 ORDERS = [
     (diffrax.Heun(), 2, [0.02, 0.01, 0.005]),
-    (RK4(), 4, [0.1, 0.05, 0.025]),
+    (jd.solvers.RK4(), 4, [0.1, 0.05, 0.025]),
     (diffrax.Tsit5(), 5, [0.1, 0.05, 0.025]),
     (diffrax.Dopri8(), 8, [1.0, 0.5, 0.25]),
     pytest.param(diffrax.Kvaerno5(), 5, [0.1, 0.05, 0.025], marks=pytest.mark.slow),
@@ -134,7 +123,7 @@ ORDERS = [
 @pytest.mark.parametrize(("solver", "order", "steps"), ORDERS, ids=lambda x: type(x).__name__)
 def test_order_of_convergence_with_retraction(solver, order, steps):
     """A spinning top on a ball joint and an axisymmetric body in flight: all errors fall with h^order."""
-    builder = ModelBuilder("bodies", gravity=None)
+    builder = jd.ModelBuilder("bodies", gravity=None)
     builder.add_body("ball", joint="spherical", joint_name="a", inertia=(1.0, (0, 0, 0), MOMENTS))
     builder.add_body("flyer", joint="free", joint_name="b", inertia=(1.3, (0, 0, 0), SYMMETRIC))
     bodies = builder.build()
@@ -147,8 +136,8 @@ def test_order_of_convergence_with_retraction(solver, order, steps):
     def run(h):
         # Of the implicit method's inner iteration.
         tolerance = 1e-13 if isinstance(solver, diffrax.Kvaerno5) else None
-        steps = Steps(h, rtol=tolerance, atol=tolerance, max_steps=1024)
-        out = simulate(bodies, q0, v0, [0.0, 2.0], solver=solver, stepsize=steps)
+        steps = jd.simulation.Steps(h, rtol=tolerance, atol=tolerance, max_steps=1024)
+        out = jd.simulate(bodies, q0, v0, [0.0, 2.0], solver=solver, stepsize=steps)
         return out.q[-1], out.v[-1], out.success, out.stats["num_steps"]
 
     q, v, success, count = (np.asarray(x) for x in run(jnp.asarray(steps)))
@@ -191,9 +180,9 @@ def test_panda_against_pinocchio_and_scipy():
     ts = np.linspace(0, 1, 11)
     x0 = np.concatenate([bridge.q_to_pinocchio(q0), v0])
     reference = solve_ivp(rate, (0, 1), x0, "DOP853", ts, rtol=1e-12, atol=1e-12).y.T
-    scene = Scene(model, forces=(JointDamping(2.0),))
+    scene = jd.Scene(model, forces=(jd.forces.JointDamping(2.0),))
     control = Feedback(jnp.asarray(0.4), jnp.asarray(push))
-    solution = simulate(scene, q0, v0, ts, control=control, stepsize=within(1e-12))
+    solution = jd.simulate(scene, q0, v0, ts, control=control, stepsize=within(1e-12))
     scale = np.abs(reference[:, robot.nq :]).max()
     np.testing.assert_allclose(solution.q, reference[:, : robot.nq], rtol=0, atol=1e-9)
     np.testing.assert_allclose(solution.v, reference[:, robot.nq :], rtol=0, atol=1e-9 * scale)
@@ -202,11 +191,14 @@ def test_panda_against_pinocchio_and_scipy():
 @pytest.fixture(scope="module")
 def driven(leg):
     """The leg with damping, friction, a spring and a control, with every output."""
-    forces = (JointDamping(0.1), CoulombFriction(0.05, v_s=0.5), JointSpring(1.5))
+    forces = (jd.forces.JointDamping(0.1), jd.forces.CoulombFriction(0.05, v_s=0.5), jd.forces.JointSpring(1.5))
     control = Feedback(jnp.asarray(0.05), jnp.asarray([0.3, -0.2, 0.1, 0.4]))
-    options = {"stepsize": within(1e-12), "outputs": ("energy", "work", "power", "acceleration", Pose("foot"))}
-    scene = Scene(leg, forces=forces)
-    return scene, control, simulate(scene, Q0, V0, np.linspace(0, 2, 401), control=control, **options)
+    options = {
+        "stepsize": within(1e-12),
+        "outputs": ("energy", "work", "power", "acceleration", jd.simulation.Pose("foot")),
+    }
+    scene = jd.Scene(leg, forces=forces)
+    return scene, control, jd.simulate(scene, Q0, V0, np.linspace(0, 2, 401), control=control, **options)
 
 
 @pytest.mark.long
@@ -227,8 +219,8 @@ def test_outputs_are_those_of_the_saved_states(driven, leg):
     @jax.vmap
     def direct(q, v, t):
         tau = control(q, v, t) + scene.applied_force(q, v, t)
-        energy = kinetic_energy(leg, q, v) + potential_energy(leg, q)
-        return energy, jnp.sum(tau * v), forward_dynamics(leg, q, v, tau), frame_pose(leg, q, "foot")
+        energy = jd.kinetic_energy(leg, q, v) + jd.potential_energy(leg, q)
+        return energy, jnp.sum(tau * v), jd.forward_dynamics(leg, q, v, tau), jd.frame_pose(leg, q, "foot")
 
     expected = direct(solution.q, solution.v, solution.ts)
     computed = solution.energy, solution.power, solution.acceleration, solution.poses["foot"]
@@ -246,10 +238,12 @@ def test_outputs_are_those_of_the_saved_states(driven, leg):
 @pytest.mark.slow
 def test_stiff_friction_with_an_implicit_method():
     """Dry friction smoothed over 1e-5 m/s: sinh(v / v_s) decays at level / (m v_s) = 5e4 1/s."""
-    scene = Scene(slider(2.0), forces=(CoulombFriction(1.0, v_s=1e-5),))
+    scene = jd.Scene(slider(2.0), forces=(jd.forces.CoulombFriction(1.0, v_s=1e-5),))
     # It slides from 1 m/s at -0.5 m/s^2 and is at rest, all but v_s, at 2 s.
     ts = np.array([0.0, 0.5, 1.0, 1.9, 2.5, 4.0])
-    solution = simulate(scene, [0.0], [1.0], ts, solver=diffrax.Kvaerno5(), stepsize=Steps(rtol=1e-8, atol=1e-10))
+    solution = jd.simulate(
+        scene, [0.0], [1.0], ts, solver=diffrax.Kvaerno5(), stepsize=jd.simulation.Steps(rtol=1e-8, atol=1e-10)
+    )
     at_rest = ts > 2
     np.testing.assert_allclose(solution.v[~at_rest, 0], 1 - 0.5 * ts[~at_rest], rtol=0, atol=1e-7)
     np.testing.assert_allclose(solution.v[at_rest, 0], 0, atol=1e-8)
@@ -271,9 +265,9 @@ def leg_end(leg, z, q0, **options):
     """A number that depends on everything: masses, start, force coefficients, and a control."""
     masses, dq, v0, gain, push = jnp.split(z, np.cumsum(SIZES)[:-1])
     model = eqx.tree_at(lambda m: m.inertias, leg, leg.inertias * masses[:, None])
-    scene = Scene(model, forces=(JointDamping(gain[0]), JointSpring(gain[1])))
+    scene = jd.Scene(model, forces=(jd.forces.JointDamping(gain[0]), jd.forces.JointSpring(gain[1])))
     control = Feedback(gain[2], push)
-    out = simulate(scene, integrate(leg, q0, dq), v0, [0.0, 0.3, 0.5], control=control, **options)
+    out = jd.simulate(scene, jd.integrate(leg, q0, dq), v0, [0.0, 0.3, 0.5], control=control, **options)
     return jnp.sum(out.q[-1] * jnp.arange(1.0, 6.0)) + jnp.sum(out.v[1:] * jnp.arange(1.0, 5.0)[None])
 
 
@@ -292,15 +286,15 @@ def test_reverse_mode_against_finite_differences(leg):
     # The steps are chosen anew at every shifted point, so the tolerance 1e-13 is seen through the step 1e-4.
     np.testing.assert_allclose(gradient, slope, rtol=1e-6, atol=1e-6)
     hanging = POINT * (np.arange(POINT.size) < 2)
-    at_rest = np.asarray(reverse(jnp.asarray(hanging), neutral(leg)))
+    at_rest = np.asarray(reverse(jnp.asarray(hanging), jd.neutral(leg)))
     assert np.isfinite(at_rest).all() and np.any(at_rest)
 
 
 def swing(pendulum, z, **options):
     """A number that depends on mass, start, damping and control of a pendulum."""
     model = eqx.tree_at(lambda m: m.inertias, pendulum, pendulum.inertias * z[0])
-    scene = Scene(model, forces=(JointDamping(z[3]),))
-    out = simulate(scene, z[1:2], z[2:3], [0.0, 0.3, 0.5], control=Feedback(z[4], z[5:]), **options)
+    scene = jd.Scene(model, forces=(jd.forces.JointDamping(z[3]),))
+    out = jd.simulate(scene, z[1:2], z[2:3], [0.0, 0.3, 0.5], control=Feedback(z[4], z[5:]), **options)
     return jnp.sum(out.q) + 2 * jnp.sum(out.v)
 
 
@@ -311,7 +305,7 @@ def test_modes_and_second_order(pendulum):
     rest = np.array([1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
 
     def direct(z):
-        return swing(pendulum, z, adjoint="direct", stepsize=Steps(0.05, max_steps=16))
+        return swing(pendulum, z, adjoint="direct", stepsize=jd.simulation.Steps(0.05, max_steps=16))
 
     def gradient_twice(z):
         gradient = jax.grad(direct)(z)
@@ -345,8 +339,8 @@ def test_continuous_adjoint(pendulum):
 
 def lane(leg, q0, v0, mass, control):
     model = eqx.tree_at(lambda m: m.inertias, leg, leg.inertias * mass)
-    scene = Scene(model, forces=(JointDamping(0.1),))
-    return simulate(scene, q0, v0, np.linspace(0, 1, 5), control=control, stepsize=0.01, outputs=("energy", "work"))
+    scene = jd.Scene(model, forces=(jd.forces.JointDamping(0.1),))
+    return jd.simulate(scene, q0, v0, np.linspace(0, 1, 5), control=control, stepsize=0.01, outputs=("energy", "work"))
 
 
 @pytest.mark.long
@@ -365,13 +359,13 @@ def test_batch_is_the_loop_and_one_bad_lane_stops_no_other(leg):
             # Sums are vectorised differently.
             np.testing.assert_allclose(getattr(batch, name)[i], getattr(single, name), rtol=1e-10, atol=1e-11)
     np.testing.assert_array_equal(batch.success, [True, True, True, False, False])
-    np.testing.assert_array_equal(batch.result == RESULTS.nonfinite_start, [False, False, False, True, True])
+    np.testing.assert_array_equal(batch.result == jd.RESULTS.nonfinite_start, [False, False, False, True, True])
     assert np.isnan(batch.q[3:]).all() and np.isnan(batch.energy[3:]).all()
 
 
 def test_float32(pendulum):
     single = jax.tree.map(lambda x: x.astype(jnp.float32), pendulum)
-    solution = simulate(single, [1.0], [0.0], [0.0, 1.0, 2.0], outputs=("energy",))
+    solution = jd.simulate(single, [1.0], [0.0], [0.0, 1.0, 2.0], outputs=("energy",))
     assert {x.dtype for x in (solution.q, solution.v, solution.ts, solution.energy)} == {jnp.dtype(jnp.float32)}
     # Tolerances of 1e-8 are raised to 1.2e-6, ten times the rounding error.
     np.testing.assert_allclose(solution.energy, -9.81 * np.cos(1.0), rtol=0, atol=2e-4)
@@ -392,8 +386,10 @@ def test_other_numbers_do_not_compile_anew(pendulum, name, usual, other, array):
 
     def run(mass, coefficient, q0, end, number):
         model = pendulum.replace(inertias=pendulum.inertias * mass)
-        scene = Scene(model, forces=(JointDamping(coefficient),))
-        return simulate(scene, q0, [0.1], [0.0, 0.5, end], control=control, stepsize=Steps(**{name: number})).q[-1, 0]
+        scene = jd.Scene(model, forces=(jd.forces.JointDamping(coefficient),))
+        return jd.simulate(
+            scene, q0, [0.1], [0.0, 0.5, end], control=control, stepsize=jd.simulation.Steps(**{name: number})
+        ).q[-1, 0]
 
     numbers = (1.0, 0.1, [0.2], 1.0, usual)
     first = run(*numbers)
@@ -417,8 +413,8 @@ def test_known_numbers_stay_known_in_a_trace(pendulum):
         seen.append(isinstance(system.inertias, jax.core.Tracer))
         return jnp.zeros_like(v)
 
-    scene = Scene(pendulum, forces=(force,))
-    jax.jit(lambda q: simulate(scene, q, [0.0], [0.0, 0.1], stepsize=0.05).q).lower(jnp.zeros(1))
+    scene = jd.Scene(pendulum, forces=(force,))
+    jax.jit(lambda q: jd.simulate(scene, q, [0.0], [0.0, 0.1], stepsize=0.05).q).lower(jnp.zeros(1))
     assert seen and not any(seen)
 
 
@@ -433,19 +429,19 @@ def test_failures_are_codes_or_errors(pendulum):
     with pytest.raises(
         RuntimeError, match=r"stopped at t = .* of 4 s.*maximum number of solver steps.*max_steps \(now 9\)"
     ):
-        simulate(pendulum, [1.0], [0.0], ts, stepsize=Steps(max_steps=9))
-    short = simulate(pendulum, [1.0], [0.0], ts, stepsize=Steps(max_steps=9), throw=False)
-    assert short.result == RESULTS.max_steps_reached and not short.success
+        jd.simulate(pendulum, [1.0], [0.0], ts, stepsize=jd.simulation.Steps(max_steps=9))
+    short = jd.simulate(pendulum, [1.0], [0.0], ts, stepsize=jd.simulation.Steps(max_steps=9), throw=False)
+    assert short.result == jd.RESULTS.max_steps_reached and not short.success
     reached = float(short.stats["time_reached"])
     np.testing.assert_array_equal(np.isnan(short.q[:, 0]), np.asarray(ts) > reached)
     assert 0.1 < reached < 4 and int(short.stats["num_steps"]) == 9
     with pytest.raises(RuntimeError, match=r"stopped at t = 0\.(29\d*|3) s.*minimum step size.*singular mass matrix"):
-        simulate(pendulum, [1.0], [0.0], ts, control=control)
-    solution = simulate(pendulum, [1.0], [0.0], ts, control=control, throw=False)
-    assert solution.result == RESULTS.dt_min_reached
+        jd.simulate(pendulum, [1.0], [0.0], ts, control=control)
+    solution = jd.simulate(pendulum, [1.0], [0.0], ts, control=control, throw=False)
+    assert solution.result == jd.RESULTS.dt_min_reached
     np.testing.assert_array_equal(np.isnan(solution.v[:, 0]), [False, False, True, True])
     with pytest.raises(RuntimeError, match=r"became NaN or infinite.*smaller stepsize"):
-        simulate(pendulum, [1.0], [0.0], ts, control=control, stepsize=0.05)
+        jd.simulate(pendulum, [1.0], [0.0], ts, control=control, stepsize=0.05)
 
 
 def test_a_derivative_that_is_nan_from_the_start_ends_soon(pendulum):
@@ -456,7 +452,7 @@ def test_a_derivative_that_is_nan_from_the_start_ends_soon(pendulum):
     @jax.vmap
     def run(mass):
         model = eqx.tree_at(lambda m: m.inertias, pendulum, pendulum.inertias * mass)
-        return simulate(model, [1.0], [0.0], [0.0, 1.0])
+        return jd.simulate(model, [1.0], [0.0], [0.0, 1.0])
 
     solution = run(massless)
     np.testing.assert_array_equal(solution.success, [True, False])
@@ -465,13 +461,15 @@ def test_a_derivative_that_is_nan_from_the_start_ends_soon(pendulum):
 
 
 def test_throw_inside_jit(pendulum):
-    run = jax.jit(lambda q: simulate(pendulum, q, [0.0], [0.0, 4.0], stepsize=Steps(max_steps=5), throw=True).q)
+    run = jax.jit(
+        lambda q: jd.simulate(pendulum, q, [0.0], [0.0, 4.0], stepsize=jd.simulation.Steps(max_steps=5), throw=True).q
+    )
     with pytest.raises(Exception, match="maximum number of solver steps"):
         jax.block_until_ready(run(jnp.ones(1)))
 
 
 def test_progress_meter(pendulum, capfd):
-    simulate(pendulum, [1.0], [0.0], [0.0, 0.5], stepsize=0.01, events=[events.Progress()])
+    jd.simulate(pendulum, [1.0], [0.0], [0.0, 0.5], stepsize=0.01, events=[events.Progress()])
     jax.effects_barrier()
     shown = capfd.readouterr()
     assert "100.00%" in shown.out + shown.err
@@ -500,7 +498,7 @@ def nothing(q, v, t):
         ({"control": nothing}, r"control returned shape \(3,\), expected \(4,\)"),
         ({"method": "schur"}, "method is 'schur'; a scene without constraints takes 'auto' or 'free'"),
         ({"solver": diffrax.Tsit5}, "solver is .*; pass an instance of a diffrax solver"),
-        ({"solver": RK4()}, "solver RK4 has no error estimate for adaptive steps; pass stepsize="),
+        ({"solver": jd.solvers.RK4()}, "solver RK4 has no error estimate for adaptive steps; pass stepsize="),
         ({"solver": diffrax.SemiImplicitEuler(), "stepsize": 0.1}, "SemiImplicitEuler does not take a single ODETerm"),
         ({"stepsize": -0.1}, "stepsize is -0.1; pass a positive number"),
         ({"stepsize": np.nan}, "stepsize is nan; pass a positive number"),
@@ -512,20 +510,20 @@ def nothing(q, v, t):
         ({"adjoint": "adjoint"}, "adjoint is 'adjoint'; choose one of reverse, direct, forward, backsolve"),
         ({"outputs": ("energy", "heat")}, "outputs has 'heat'; choose from energy, power"),
         ({"outputs": "energy"}, "outputs is the string 'energy'; pass a tuple"),
-        ({"outputs": (Pose("fot"),)}, "frame 'fot' is not in model 'leg'; did you mean foot"),
-        ({"stepsize": Steps(max_steps=0)}, "max_steps is 0; pass a positive integer"),
+        ({"outputs": (jd.simulation.Pose("fot"),)}, "frame 'fot' is not in model 'leg'; did you mean foot"),
+        ({"stepsize": jd.simulation.Steps(max_steps=0)}, "max_steps is 0; pass a positive integer"),
         ({"scene": 3}, "system is a int, which has no nq and nv"),
     ],
 )
 def test_refused(leg, arguments, message):
     given = {"scene": leg, "q0": Q0, "v0": V0, "ts": [0.0, 0.1]} | arguments
     with pytest.raises(ValueError, match=message):
-        simulate(given.pop("scene"), given.pop("q0"), given.pop("v0"), given.pop("ts"), **given)
+        jd.simulate(given.pop("scene"), given.pop("q0"), given.pop("v0"), given.pop("ts"), **given)
 
 
 def test_quaternions_near_unit_length_are_normalised(leg):
     """0.05 % off is taken for rounding in a file; the motion is that of the unit quaternion."""
-    run = eqx.filter_jit(lambda q: simulate(leg, q, V0, [0.0, 0.1], stepsize=0.05).q)
+    run = eqx.filter_jit(lambda q: jd.simulate(leg, q, V0, [0.0, 0.1], stepsize=0.05).q)
     scaled = jnp.asarray(Q0 * np.array([1.0005] * 4 + [1.0]))
     np.testing.assert_allclose(run(scaled), run(jnp.asarray(Q0)), rtol=1e-14, atol=1e-15)
 
@@ -533,7 +531,7 @@ def test_quaternions_near_unit_length_are_normalised(leg):
 @pytest.mark.long
 @pytest.mark.parametrize(
     "wrapped",
-    [LieGroup(diffrax.Tsit5()), pytest.param(diffrax.HalfSolver(diffrax.Tsit5()), marks=pytest.mark.slow)],
+    [jd.solvers.LieGroup(diffrax.Tsit5()), pytest.param(diffrax.HalfSolver(diffrax.Tsit5()), marks=pytest.mark.slow)],
     ids=["Lie", "half"],
 )
 @pytest.mark.parametrize("name", ["free_body", pytest.param("rolling_coin", marks=pytest.mark.slow)])
@@ -541,7 +539,7 @@ def test_methods_that_wrap_an_explicit_one(wrapped, name):
     """In local coordinates, and with errors by halved steps: the motion is that of Dopri8, with and without constraints."""
     computed = getattr(scenes, name)
     state, ts = computed.start(), jnp.linspace(0.0, 0.5, 3)
-    solutions = [simulate(computed(), *state, ts, solver=solver) for solver in (diffrax.Dopri8(), wrapped)]
+    solutions = [jd.simulate(computed(), *state, ts, solver=solver) for solver in (diffrax.Dopri8(), wrapped)]
     assert_close(solutions[1].q, solutions[0].q, 1e-6)  # local errors of 1e-8 along the way
     assert_close(solutions[1].v, solutions[0].v, 1e-6)
 
@@ -549,15 +547,15 @@ def test_methods_that_wrap_an_explicit_one(wrapped, name):
 @pytest.mark.long
 def test_constraints_may_be_functions_that_hold_numbers_of_a_batch():
     """No leaf of the scene says that they do."""
-    builder = ModelBuilder("two slides", gravity=None)
+    builder = jd.ModelBuilder("two slides", gravity=None)
     for name, axis in (("a", (1, 0, 0)), ("b", (0, 1, 0))):
         builder.add_body(name, joint="prismatic", axis=axis, inertia=(1.0, (0, 0, 0), MOMENTS))
     model = builder.build()
 
     def run(slope):
-        scene = Scene(model, (Holonomic(lambda q, t: (q[0] - slope * q[1])[None]),))
+        scene = jd.Scene(model, (jd.Holonomic(lambda q, t: (q[0] - slope * q[1])[None]),))
         v = jnp.stack([slope, jnp.ones_like(slope)])
-        return simulate(scene, jnp.zeros(2), v, [0.0, 0.5], throw=False).q[-1]
+        return jd.simulate(scene, jnp.zeros(2), v, [0.0, 0.5], throw=False).q[-1]
 
     slopes = jnp.asarray([1.0, 2.0])
     np.testing.assert_allclose(jax.jit(jax.vmap(run))(slopes), 0.5 * jnp.stack([slopes, jnp.ones(2)], 1), rtol=1e-12)

@@ -8,20 +8,7 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn import geometry, scenes, se3
-from jaxdyn.compile import compilation
-from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.dynamics.centroidal import center_of_mass
-from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, spatial_jacobian
-from jaxdyn.forces.drives import SlidingFriction
-from jaxdyn.forces.elements import JointDamping
-from jaxdyn.geometry.immersion import constrain_by_immersion, reaction_force
-from jaxdyn.lie.so3 import hat
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.simulation.options import Steps
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
 
 G = 9.81
 STATES = np.random.default_rng(8).normal(size=(3, 20, 4))
@@ -151,8 +138,8 @@ def spatial_arm(q, v, a):
 
     def in_space(q):
         """Rotation, and translational and rotational Jacobian in the world's axes, of each link."""
-        turned = [frame_pose(model, q, f"centre{i}")[:3, :3] for i in (1, 2, 3)]
-        jacobians = [body_jacobian(model, q, f"centre{i}") for i in (1, 2, 3)]
+        turned = [jd.frame_pose(model, q, f"centre{i}")[:3, :3] for i in (1, 2, 3)]
+        jacobians = [jd.body_jacobian(model, q, f"centre{i}") for i in (1, 2, 3)]
         return [(R, R @ J[:3], R @ J[3:]) for R, J in zip(turned, jacobians, strict=True)]
 
     links, rates = jax.jvp(in_space, (q,), (v,))
@@ -164,18 +151,18 @@ def spatial_arm(q, v, a):
         inertia, w = R @ moments @ R.T, JR @ v
         by_links = by_links + mass * Jt.T @ Jt + JR.T @ inertia @ JR
         even = mass * Jt.T @ Jt_rate + JR.T @ inertia @ JR_rate
-        bias = bias + (even - JR.T @ hat(inertia @ w) @ JR) @ v
-        in_space_axes = in_space_axes + even + JR.T @ hat(w) @ inertia @ JR
+        bias = bias + (even - JR.T @ jd.so3.hat(inertia @ w) @ JR) @ v
+        in_space_axes = in_space_axes + even + JR.T @ jd.so3.hat(w) @ inertia @ JR
         Jv, Jw = R.T @ Jt, R.T @ JR
         Jv_rate, Jw_rate = R_rate.T @ Jt + R.T @ Jt_rate, R_rate.T @ JR + R.T @ JR_rate
-        in_body_axes = in_body_axes + mass * Jv.T @ (Jv_rate + hat(Jw @ v) @ Jv)
-        in_body_axes = in_body_axes + Jw.T @ moments @ Jw_rate - Jw.T @ hat(moments @ Jw @ v) @ Jw
+        in_body_axes = in_body_axes + mass * Jv.T @ (Jv_rate + jd.so3.hat(Jw @ v) @ Jv)
+        in_body_axes = in_body_axes + Jw.T @ moments @ Jw_rate - Jw.T @ jd.so3.hat(moments @ Jw @ v) @ Jw
         weight = weight + mass * Jt.T @ jnp.asarray([0.0, 0.0, -G])
         force, torque = jnp.roll(a, i), jnp.roll(v, -i)
         pushed = pushed + Jt.T @ force + JR.T @ torque
         at_joint = R.T @ torque + jnp.cross(jnp.asarray(CENTRES[i]), R.T @ force)
         wrenches.append(jnp.concatenate([R.T @ force, at_joint]))
-    whole = jax.jacfwd(lambda q: center_of_mass(model, q))(q)
+    whole = jax.jacfwd(lambda q: jd.center_of_mass(model, q))(q)
     mass_rate = jax.jvp(lambda q: dynamics.mass_matrix(model, q), (q,), (v,))[1]
     h1, h2 = 0.2, 0.5 - 0.25 * jnp.sin(q[1])
     h3 = 0.5 - 0.4 * jnp.sin(q[1]) - 0.15 * jnp.sin(q[1] + q[2])
@@ -212,7 +199,7 @@ def test_spatial_arm():
     assert_close(M[-1][(0, 1, 1, 2), (0, 1, 2, 2)], [0.457483792, 0.449281062, 0.088390531, 0.0425], 2e-9)
     assert_close(coriolis[-1], [0.08628446, 0.01508056, -0.02029184], 1e-7)
     assert_close(N[-1], [0, -9.53782516, -1.40577764], 1e-8)
-    twists = spatial_jacobian(scenes.spatial_arm().system, jnp.zeros(3), "centre3").T
+    twists = jd.dynamics.spatial_jacobian(scenes.spatial_arm().system, jnp.zeros(3), "centre3").T
     assert_close(twists, [[0, 0, 0, 0, 0, 1], [0, -0.5, 0, -1, 0, 0], [0, -0.5, 0.4, -1, 0, 0]], 1e-15)
 
 
@@ -234,10 +221,10 @@ def test_rigid_body_in_euler_angles():
     """Metric, geodesic form and torques; equal to Euler's equations, to a quaternion model, and to that model immersed."""
     moments = jnp.asarray([1.0, 2.0, 3.0])
     system = scenes.rigid_body_in_euler_angles().system
-    builder = ModelBuilder("body", gravity=None)
+    builder = jd.ModelBuilder("body", gravity=None)
     builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
     model = builder.build()
-    immersed = constrain_by_immersion(model, euler_quaternion, 3)
+    immersed = jd.geometry.constrain_by_immersion(model, euler_quaternion, 3)
 
     def rates(q):
         st, ct, sp, cp = jnp.sin(q[1]), jnp.cos(q[1]), jnp.sin(q[2]), jnp.cos(q[2])
@@ -297,7 +284,7 @@ def test_double_pendulum_in_four_formulations():
         rows, energies = [], []
         for name, scene in built.items():
             q, v = scenes.double_pendulum.start(formulation=name, angles=angles, rates=rates)
-            got = constrained_dynamics(scene, q, v).acceleration
+            got = jd.constrained_dynamics(scene, q, v).acceleration
             theta = got[0]
             phi = got[0] + got[1] if name == "model" else got[-1]
             rows.append(jnp.stack([theta, phi]))
@@ -344,7 +331,7 @@ def test_lagrangian_takes_no_more_operations_than_bodies():
     """As operations of JAX, which XLA counts; and the bias of a metric takes fewer than its Christoffel symbols."""
 
     def operations(function, *arguments):
-        with compilation("plain"):
+        with jd.compilation("plain"):
             return jax.jit(jax.vmap(function)).lower(*arguments).compile().cost_analysis()["flops"]
 
     batch = jnp.ones((4096, 2))
@@ -385,7 +372,7 @@ def test_disk_and_link_in_contact():
         dry = jnp.stack([-m2 * G * k, 0 * k, m2 * G * k, torque - a * m2 * G])
         friction = jnp.stack([f1 * s * k + f1 * c - f2, -f1 - f2, -f1 * s * k - f1 * c, a * f1 * s])
         pulled = scene.applied_force(q, v) - dynamics.gravity_force(scene.system, q)
-        disk, link = reaction_force(scene, q, v)
+        disk, link = jd.geometry.reaction_force(scene, q, v)
         nu, u = link[1] / c, disk[1] + link[1]
         zero = jnp.zeros(())
         (z1, height, _), (y1, y2, _) = scene.system.configurations(q, zero)
@@ -404,7 +391,7 @@ def test_disk_and_link_in_contact():
 def test_pendulum_has_the_elliptic_motion():
     """Problem A01 of the IFToMM benchmark library, from rest at 90 degrees."""
     q0, v0 = scenes.pendulum.start()
-    solution = simulate(
+    solution = jd.simulate(
         scenes.pendulum(),
         q0,
         v0,
@@ -418,27 +405,27 @@ def test_pendulum_has_the_elliptic_motion():
 
 
 def one_way_block(mass, direction):
-    friction = SlidingFriction(0.3, mass * G, direction)
-    return Scene(scenes.sliding_block(mass=mass).system, forces=(friction,))
+    friction = jd.forces.SlidingFriction(0.3, mass * G, direction)
+    return jd.Scene(scenes.sliding_block(mass=mass).system, forces=(friction,))
 
 
 def test_block_slides_until_it_stops():
     """It stops after v0 / (mu g), v0^2 / (2 mu g) further on; slid the other way it is the mirror image."""
     stop = 2.0 / (0.3 * G)
     q0, v0 = scenes.sliding_block.start(velocity=2.0)
-    solution = simulate(one_way_block(1.7, 1), q0, v0, jnp.asarray([0.0, stop]), stepsize=stop / 2)
+    solution = jd.simulate(one_way_block(1.7, 1), q0, v0, jnp.asarray([0.0, stop]), stepsize=stop / 2)
     assert_close(solution.q[-1], [2.0**2 / (2 * 0.3 * G)], 1e-13)  # the method is exact for a parabola
     assert_close(solution.v[-1], [0.0], 1e-13)
     assert_close(one_way_block(1.7, -1).applied_force(q0, -v0), [0.3 * 1.7 * G], 1e-15)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_block_sticks_where_it_stops():
     """Said by an event, at the time of the closed form; steps of fixed length end there too."""
     stop, ts = 2.0 / (0.3 * G), jnp.asarray([0.0, 0.5, 2.0])
     q0, v0 = scenes.sliding_block.start(velocity=2.0)
-    for steps in (Steps(rtol=1e-11, atol=1e-11), 0.1):
-        solution = simulate(scenes.sliding_block(mass=1.7), q0, v0, ts, stepsize=steps)
+    for steps in (jd.simulation.Steps(rtol=1e-11, atol=1e-11), 0.1):
+        solution = jd.simulate(scenes.sliding_block(mass=1.7), q0, v0, ts, stepsize=steps)
         assert bool(solution.success) and list(solution.events.name[:2]) == ["friction: stick", ""]
         assert_close(solution.events.time[0], stop, 1e-12)
         assert_close(solution.q[1:, 0], [1.0 - 0.15 * G * 0.25, 2.0**2 / (0.6 * G)], 1e-12)
@@ -452,10 +439,10 @@ def test_a_block_that_has_stopped_gains_no_energy():
     scene, (q0, v0) = one_way_block(1.0, 1), scenes.sliding_block.start(velocity=2.0)
     ts = jnp.asarray([0.0, 3 * stop])
     with pytest.raises(RuntimeError, match=r"jd\.contact\.DryFriction"):
-        simulate(scene, q0, v0, ts, stepsize=jd.simulation.Steps(max_steps=500))
-    solution = simulate(scene, q0, v0, ts, throw=False, stepsize=jd.simulation.Steps(max_steps=500))
+        jd.simulate(scene, q0, v0, ts, stepsize=jd.simulation.Steps(max_steps=500))
+    solution = jd.simulate(scene, q0, v0, ts, throw=False, stepsize=jd.simulation.Steps(max_steps=500))
     assert not bool(solution.success) and abs(float(solution.stats["time_reached"]) - stop) < 1e-3
-    solution = simulate(scene, q0, v0, ts, stepsize=h, throw=False)
+    solution = jd.simulate(scene, q0, v0, ts, stepsize=h, throw=False)
     assert abs(float(solution.v[-1, 0])) < 0.3 * G * h and abs(float(solution.q[-1, 0]) - 4 / (0.6 * G)) < 2 * h
     assert_close(scene.applied_force(q0, -v0), [0.3 * G], 1e-15)
 
@@ -468,7 +455,7 @@ def test_trajectories_are_differentiated_by_parameters_of_the_lagrangian():
     def end(p):
         scene = scenes.double_pendulum(masses=(p[0], p[1]), length=p[2], reaches=(p[3], p[4]), gravity=p[5])
         q0, v0 = scenes.double_pendulum.start()
-        solution = simulate(scene, q0, v0, jnp.asarray([0.0, 0.5]), stepsize=0.025)
+        solution = jd.simulate(scene, q0, v0, jnp.asarray([0.0, 0.5]), stepsize=0.025)
         return jnp.sum(jnp.asarray([1.0, -0.7]) * solution.q[-1]) + solution.v[-1, 0]
 
     step = 1e-5 * np.eye(6)
@@ -501,18 +488,18 @@ def test_separate_scenes_are_joined_with_their_forces():
     """Kron's method with forces on each unit, moving: a motor drives one end of a spring, through both frictions."""
 
     def sliding(mass):
-        return LagrangianSystem(lambda q, v, t, p: 0.5 * p * v[0] ** 2 - 2.0 * q[0] ** 2, 1, parameters=mass)
+        return jd.LagrangianSystem(lambda q, v, t, p: 0.5 * p * v[0] ** 2 - 2.0 * q[0] ** 2, 1, parameters=mass)
 
-    units = tuple(Scene(sliding(m), forces=(JointDamping(c),)) for m, c in ((1.3, 0.4), (0.7, 0.9)))
+    units = tuple(jd.Scene(sliding(m), forces=(jd.forces.JointDamping(c),)) for m, c in ((1.3, 0.4), (0.7, 0.9)))
     between = lambda q, v, t: (3.0 * jnp.ones(1), jnp.sin(q[0]))  # noqa: E731
     xi = lambda s, t: (2.0 * s, 3.0 * s + jnp.sin(t))  # noqa: E731
-    scene = constrain_by_immersion(units, xi, 1, moving=True, force=between)
+    scene = jd.geometry.constrain_by_immersion(units, xi, 1, moving=True, force=between)
     s, v, t = jnp.asarray([0.3]), jnp.asarray([-0.6]), jnp.asarray(0.4)
 
     @quick
     def compute(s, v, t):
-        reactions = reaction_force(scene, s, v, (jnp.ones(1), jnp.zeros(1)), t)
-        return constrained_dynamics(scene, s, v, t=t).acceleration, reactions
+        reactions = jd.geometry.reaction_force(scene, s, v, (jnp.ones(1), jnp.zeros(1)), t)
+        return jd.constrained_dynamics(scene, s, v, t=t).acceleration, reactions
 
     a, reactions = jax.tree.map(np.asarray, compute(s, v, t))
     s, v, t = (np.asarray(x) for x in (s, v, t))
@@ -526,7 +513,7 @@ def test_separate_scenes_are_joined_with_their_forces():
     assert_close(reactions[0], want, 1e-13)
     assert_close(3 * reactions[1], -2 * reactions[0], 1e-13)
     with pytest.raises(ValueError, match="force has 1 entries; give one for each of the 2 systems"):
-        reaction_force(scene, jnp.asarray(s), jnp.asarray(v), (jnp.ones(1),), t)
+        jd.geometry.reaction_force(scene, jnp.asarray(s), jnp.asarray(v), (jnp.ones(1),), t)
 
 
 def test_inertia_of_a_box_and_its_change_of_frame():
@@ -546,7 +533,7 @@ def test_inertia_of_a_box_and_its_change_of_frame():
 
 
 def test_unknown_formulations_are_refused():
-    with pytest.raises(ValueError, match="formulation is 'newton'; choose from lagrangian, model, immersion, loop"):
+    with pytest.raises(ValueError, match="formulation is 'newton'"):
         scenes.double_pendulum(formulation="newton")
     with pytest.raises(ValueError, match=r"formulation='loop' takes moments\[1\] > 0"):
         scenes.double_pendulum(formulation="loop", moments=(0.0, 0.0))

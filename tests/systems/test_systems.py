@@ -8,14 +8,7 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.forces.drives import RayleighDissipation, SlidingFriction
-from jaxdyn.forces.elements import JointDamping
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.mass_factor import solve_positive
-from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import ExplicitSystem, MetricSystem
 
 # Planar 2R arm of EQUATIONS section 1: m, l1, r, I.
 MASS, LENGTH, REACH, MOMENT = (1.0, 0.8), 1.0, (0.5, 0.4), (0.1, 0.05)
@@ -63,7 +56,7 @@ def printed_gravity(q):
 
 
 def bodies():
-    builder = ModelBuilder("2R", gravity=(0.0, -GRAVITY, 0.0))
+    builder = jd.ModelBuilder("2R", gravity=(0.0, -GRAVITY, 0.0))
     for i, parent in enumerate((None, "link0")):
         inertia = (MASS[i], (REACH[i], 0.0, 0.0), (0.0, 0.0, MOMENT[i]))
         builder.add_body(f"link{i}", parent, inertia=inertia, pose=(i * LENGTH, 0.0, 0.0))
@@ -88,14 +81,14 @@ def test_three_ways_to_give_one_arm_agree():
     """Lagrangian by automatic differentiation, printed equations, and bodies on joints."""
     rng = np.random.default_rng(0)
     q, v, a = (jnp.asarray(x) for x in rng.normal(size=(3, 2)))
-    explicit = ExplicitSystem(
+    explicit = jd.ExplicitSystem(
         printed_mass,
         lambda q, v: printed_coriolis(q, v) @ v + printed_gravity(q),
         2,
         potential=lambda q: -lagrangian(q, jnp.zeros(2), 0.0, PARAMETERS),
     )
     computed = [
-        everything(s, q, v, a) for s in (LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), explicit, bodies())
+        everything(s, q, v, a) for s in (jd.LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), explicit, bodies())
     ]
     for other in computed[1:]:
         for name, value in computed[0].items():
@@ -104,7 +97,7 @@ def test_three_ways_to_give_one_arm_agree():
 
 
 def test_coriolis_matrix_has_the_skew_property():
-    system = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS)
+    system = jd.LagrangianSystem(lagrangian, 2, parameters=PARAMETERS)
     q, v = jnp.array([0.3, 1.1]), jnp.array([0.7, -0.4])
     C = quick(lambda q, v: dynamics.coriolis_matrix(system, q, v))(q, v)
     rate = quick(lambda q, v: jax.jvp(lambda q: dynamics.mass_matrix(system, q), (q,), (v,))[1])(q, v)
@@ -120,7 +113,7 @@ def test_gyroscopic_and_moving_systems():
         absolute = v + jnp.stack([pull * t, jnp.zeros_like(t)])  # frame accelerates at `pull` along x
         return 0.5 * p["m"] * jnp.sum(absolute**2) + 0.5 * p["b"] * (q[0] * v[1] - q[1] * v[0])
 
-    system = LagrangianSystem(moving, 2, parameters={"m": 2.0, "b": field})
+    system = jd.LagrangianSystem(moving, 2, parameters={"m": 2.0, "b": field})
     q, v = jnp.array([0.4, -1.2]), jnp.array([0.8, 0.3])
     bias = quick(lambda q, v: dynamics.bias_force(system, q, v, 0.9))
     want = np.array([2.0 * pull - field * v[1], field * v[0]])  # m xdd + m pull - b ydot = 0, m ydd + b xdot = 0
@@ -132,7 +125,7 @@ def test_parameters_are_differentiated_and_batched():
     q, v, tau = jnp.array([0.3, 1.1]), jnp.array([0.7, -0.4]), jnp.array([0.2, 0.1])
 
     def acceleration(scale):
-        system = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS | {"mass": PARAMETERS["mass"] * scale})
+        system = jd.LagrangianSystem(lagrangian, 2, parameters=PARAMETERS | {"mass": PARAMETERS["mass"] * scale})
         return dynamics.forward_dynamics(system, q, v, tau)
 
     step = 1e-5
@@ -151,7 +144,7 @@ def test_small_systems_are_solved_without_lapack():
         right = root[:n, :3]
         assert_close(solve(whole[:n, :n], right), np.linalg.solve(whole[:n, :n], right), 1e-13)
     assert np.isnan(solve(np.asarray([[1.0, 2.0], [2.0, 1.0]]), np.ones(2))).all()
-    system, batch = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), jnp.ones((3, 2))
+    system, batch = jd.LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), jnp.ones((3, 2))
     motion = jax.jit(jax.vmap(lambda q: dynamics.forward_dynamics(system, q, q, q)))
     assert "lapack" not in motion.lower(batch).as_text()
 
@@ -159,8 +152,8 @@ def test_small_systems_are_solved_without_lapack():
 def test_potential_split_off_gives_the_same_system():
     rest = lambda q, t, p: -lagrangian(q, jnp.zeros(2), t, p)  # noqa: E731
     moving = lambda q, v, t, p: lagrangian(q, v, t, p) + rest(q, t, p)  # noqa: E731
-    whole = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS)
-    split = LagrangianSystem(moving, 2, parameters=PARAMETERS, potential=rest)
+    whole = jd.LagrangianSystem(lagrangian, 2, parameters=PARAMETERS)
+    split = jd.LagrangianSystem(moving, 2, parameters=PARAMETERS, potential=rest)
     q, v, a = (jnp.asarray(x) for x in np.random.default_rng(1).normal(size=(3, 2)))
     want = everything(whole, q, v, a)
     for name, value in everything(split, q, v, a).items():
@@ -174,7 +167,7 @@ def test_coriolis_matrix_holds_gyroscopic_terms():
     def charged(q, v):
         return 0.5 * (1 + q[0] ** 2) * v[0] ** 2 + 0.5 * v[1] ** 2 + q[0] * q[1] ** 2 * v[1] - jnp.sin(q[0])
 
-    system, (q, v) = LagrangianSystem(charged, 2), np.random.default_rng(3).normal(size=(2, 2))
+    system, (q, v) = jd.LagrangianSystem(charged, 2), np.random.default_rng(3).normal(size=(2, 2))
     q, v = jnp.asarray(q), jnp.asarray(v)
     C, N, h, rate = quick(
         lambda q, v: (
@@ -193,25 +186,27 @@ def test_coriolis_matrix_holds_gyroscopic_terms():
 
 def test_dissipation():
     """Rayleigh's function of damped joints is their damping; sliding friction is mu N against the sliding."""
-    system = LagrangianSystem(lagrangian, 2, parameters=PARAMETERS)
+    system = jd.LagrangianSystem(lagrangian, 2, parameters=PARAMETERS)
     q, v, t = jnp.array([0.3, 1.1]), jnp.array([0.7, -0.4]), jnp.zeros(())
     damping = jnp.array([0.4, 0.9])
-    rayleigh = RayleighDissipation(jax.tree_util.Partial(lambda d, q, v, t: 0.5 * jnp.sum(d * v * v), damping))
-    assert_close(rayleigh(system, q, v, t), JointDamping(damping)(system, q, v, t), 1e-15)
-    sliding = SlidingFriction(0.3, lambda system, q, v, t: 2.0 + q[0], -1, 1)
+    rayleigh = jd.forces.RayleighDissipation(
+        jax.tree_util.Partial(lambda d, q, v, t: 0.5 * jnp.sum(d * v * v), damping)
+    )
+    assert_close(rayleigh(system, q, v, t), jd.forces.JointDamping(damping)(system, q, v, t), 1e-15)
+    sliding = jd.forces.SlidingFriction(0.3, lambda system, q, v, t: 2.0 + q[0], -1, 1)
     assert_close(sliding(system, q, v, t), [0.0, 0.3 * 2.3], 1e-15)
-    rows = SlidingFriction(0.3, 2.0, 1, lambda q, t: jnp.stack([jnp.ones(()), q[1]]))
+    rows = jd.forces.SlidingFriction(0.3, 2.0, 1, lambda q, t: jnp.stack([jnp.ones(()), q[1]]))
     assert_close(rows(system, q, v, t), [-0.6, -0.66], 1e-15)
     with pytest.raises(ValueError, match=r"function returned shape \(2,\)"):
-        RayleighDissipation(lambda q, v, t: v)(system, q, v, t)
-    with pytest.raises(ValueError, match="direction is 0; give the sign of the sliding velocity"):
-        SlidingFriction(0.3, 2.0, 0)
+        jd.forces.RayleighDissipation(lambda q, v, t: v)(system, q, v, t)
+    with pytest.raises(ValueError, match="direction is 0"):
+        jd.forces.SlidingFriction(0.3, 2.0, 0)
     with pytest.raises(ValueError, match=r"coefficient is -0\.3"):
-        SlidingFriction(-0.3, 2.0, 1)
+        jd.forces.SlidingFriction(-0.3, 2.0, 1)
     with pytest.raises(ValueError, match="along is 2, but the system has nv = 2"):
-        SlidingFriction(0.3, 2.0, 1, 2)(system, q, v, t)
+        jd.forces.SlidingFriction(0.3, 2.0, 1, 2)(system, q, v, t)
     with pytest.raises(ValueError, match="along is 'x'"):
-        SlidingFriction(0.3, 2.0, 1, "x")
+        jd.forces.SlidingFriction(0.3, 2.0, 1, "x")
 
 
 def test_starts_without_a_motion_are_refused():
@@ -222,7 +217,7 @@ def test_starts_without_a_motion_are_refused():
         return 0.5 * (x * x + y * y + z * z)
 
     def start(lagrangian, nq, q=0.0, **options):
-        system, state = LagrangianSystem(lagrangian, nq, **options), jnp.full(nq, q)
+        system, state = jd.LagrangianSystem(lagrangian, nq, **options), jnp.full(nq, q)
         return lambda: dynamics.forward_dynamics(system, state, jnp.zeros(nq), jnp.zeros(nq))
 
     idle = (
@@ -242,26 +237,26 @@ def test_starts_without_a_motion_are_refused():
         with pytest.raises(ValueError, match=message):
             motion()
     with pytest.raises(ValueError, match=idle):
-        simulate(Scene(LagrangianSystem(swing, 2)), jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
-    flat = MetricSystem(lambda q: jnp.ones((2, 2)), 2)
+        jd.simulate(jd.Scene(jd.LagrangianSystem(swing, 2)), jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
+    flat = jd.MetricSystem(lambda q: jnp.ones((2, 2)), 2)
     with pytest.raises(ValueError, match=r"mass matrix of this MetricSystem has rank 1 of 2.*velocity \["):
         dynamics.forward_dynamics(flat, jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
 
 
 def test_bad_systems_are_refused():
     with pytest.raises(ValueError, match="nq is 0"):
-        LagrangianSystem(lagrangian, 0)
+        jd.LagrangianSystem(lagrangian, 0)
     with pytest.raises(ValueError, match="lagrangian is 3, which cannot be called"):
-        LagrangianSystem(3, 2)
-    system = ExplicitSystem(lambda q: jnp.eye(3), lambda q, v: v, 2)
+        jd.LagrangianSystem(3, 2)
+    system = jd.ExplicitSystem(lambda q: jnp.eye(3), lambda q, v: v, 2)
     q = jnp.zeros(2)
     with pytest.raises(ValueError, match=r"mass_matrix returned shape \(3, 3\), expected \(2, 2\)"):
         dynamics.mass_matrix(system, q)
-    with pytest.raises(ValueError, match="no potential energy; pass potential="):
+    with pytest.raises(ValueError, match="no potential energy"):
         jd.potential_energy(system, q)
     with pytest.raises(ValueError, match=r"q has shape \(3,\), expected \(2,\)"):
         dynamics.mass_matrix(system, jnp.zeros(3))
     with pytest.raises(ValueError, match="external holds wrenches on bodies"):
         dynamics.forward_dynamics(system, q, q, q, external=jnp.zeros((1, 6)))
     with pytest.raises(ValueError, match=r"lagrangian returned shape \(2,\)"):
-        dynamics.mass_matrix(LagrangianSystem(lambda q, v: v * v, 2), q)
+        dynamics.mass_matrix(jd.LagrangianSystem(lambda q, v: v * v, 2), q)
