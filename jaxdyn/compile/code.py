@@ -19,20 +19,14 @@ from jaxdyn.compile.body import (
     copy_bytes,
     fill_zeros,
     has_loop,
-    has_zeros,
-    is_zero,
     on_heap,
     pack,
     unpack,
-    write_call,
 )
 from jaxdyn.compile.listing import Listing
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import FLOATS, Array, Program, kind_of
 
-# A program of one sample with at least so many operations is compiled once for all kernels that contain it: the copies of a
-# call's arguments are few against them.
-MIN_SHARED_OPERATIONS = 2000
 # Operations from which on a program is a listing, and those of one that calls loops: arithmetic on the arrays that loops take and
 # return is written out entry by entry, and LLVM takes longer for operations on memory than for others.
 MIN_LISTED_OPERATIONS, MIN_LISTED_BESIDE_LOOPS = 60_000, 40_000
@@ -73,23 +67,13 @@ def subprogram_ir(called: Program, width: int, is_quick: bool = False) -> str:
         if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
             copy_bytes(e, pointer, f"%r{i}", array.size * array.dtype.itemsize * width)
             continue
-        is_empty = has_zeros(row)
-        if is_empty:
-            fill_zeros(e, f"%r{i}", array.size * array.dtype.itemsize * width)
         for k, x in enumerate(row):
-            if not (is_empty and is_zero(x)):
-                e.store_at(f"%r{i}", k, kind_of(array.dtype), body.text(x, kind_of(array.dtype)))
+            e.store_at(f"%r{i}", k, kind_of(array.dtype), body.text(x, kind_of(array.dtype)))
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
     allocations, free, declared = on_heap(body.allocations())
     lines = [head, *allocations, *e.lines, *free, "  ret void", "}"]
     return "\n".join([*lines, *declared, *e.declared.values(), *ATTRIBUTES])
-
-
-def calls_itself(program: Program, width: int) -> bool:
-    """Decide whether a kernel is a call of its program as a subprogram, whose code other kernels share."""
-    fast = program.fast or program
-    return width == 1 and fast.cost >= MIN_SHARED_OPERATIONS and not fast.subprograms
 
 
 def varying_first(uniform: Sequence[bool]) -> list[int]:
@@ -130,49 +114,29 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool], is_quick: b
             return packed.get(place)
         return rows[place][0] if place in rows else f"%a{place}"
 
-    valid, allocations, taken = None, [], 0
-    # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
-    if calls_itself(program, width):
-        pointers = [str(array(i)) for i in range(len(arrays))]
-        if program.careful is not None:
-            allocations.append("  %valid = alloca i8")
-            pointers.append("%valid")
-        write_call(e, fast, pointers)
-        valid = None if program.careful is None else e.load_at("%valid", 0, "b1")
-    else:
-        body = body_of(e, fast, load, array, is_quick)
-        for place in body.arrays_in_memory() if width > 1 else ():
-            packed[place], given = f"%packed{place}", arrays[place]
-            allocations.append(allocation(packed[place], bytes_of(given, width)))
-            source = [f"%a{place}"] * width if uniform[place] else rows[place]
-            pack(e, source, packed[place], given.size, kind_of(given.dtype))
-        body.compute()
-        for i, (row, output) in enumerate(zip(fast.results, program.outputs, strict=False)):
-            kind, pointer = kind_of(output.dtype), body.pointer_to(row, output)
-            if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
-                unpack(e, pointer, rows[count + i], len(row), kind)
-            elif has_zeros(row):
-                for at in rows[count + i]:
-                    fill_zeros(e, at, output.size * output.dtype.itemsize)
-                for k, x in enumerate(row):
-                    if not is_zero(x):
-                        e.store(rows[count + i], k, kind, body.text(x, kind))
-            else:
-                e.store_array(rows[count + i], kind, [body.text(x, kind) for x in row])
-        if program.careful is not None:
-            valid = body.text(fast.results[-1][0], "b1")
-        taken, body.careful = body.careful, 0
-        allocations += body.allocations()
-    if valid is not None and program.careful is not None:
-        flag = e.operation("not", "b1", [valid], "b1")
+    allocations, body = [], body_of(e, fast, load, array, is_quick)
+    for place in body.arrays_in_memory() if width > 1 else ():
+        packed[place], given = f"%packed{place}", arrays[place]
+        allocations.append(allocation(packed[place], bytes_of(given, width)))
+        source = [f"%a{place}"] * width if uniform[place] else rows[place]
+        pack(e, source, packed[place], given.size, kind_of(given.dtype))
+    body.compute()
+    for i, (row, output) in enumerate(zip(fast.results, program.outputs, strict=False)):
+        kind, pointer = kind_of(output.dtype), body.pointer_to(row, output)
+        if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
+            unpack(e, pointer, rows[count + i], len(row), kind)
+        else:
+            e.store_array(rows[count + i], kind, [body.text(x, kind) for x in row])
+    if program.careful is not None:
+        flag = e.operation("not", "b1", [body.text(fast.results[-1][0], "b1")], "b1")
         same = [*uniform, *[False] * len(program.outputs)]
         places = [(f"%a{i}", 0 if same[i] else x.size * x.dtype.itemsize) for i, x in enumerate(arrays)]
-        taken = max(taken, careful.write_call_of_rows(e, program.careful, flag, places))
+        body.careful = max(body.careful, careful.write_call_of_rows(e, program.careful, flag, places))
     # Arguments that are not read are not in the code, but the handler checks their sizes, so that the hash covers them.
     sizes = " ".join(
         f"{'same' if i < count and uniform[i] else 'each'}:{x.size}x{x.dtype}" for i, x in enumerate(arrays)
     )
-    return wrap_kernel(e, f"{count} {sizes}", uniform, len(program.outputs), [*allocations, *careful.allocation(taken)])
+    return wrap_kernel(e, f"{count} {sizes}", uniform, len(program.outputs), [*allocations, *body.allocations()])
 
 
 def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocations: Sequence[str]) -> str:

@@ -182,18 +182,12 @@ class _Expansion:
         return self._repair(results, program, again, args)
 
     def _subprogram(self, inner: ClosedJaxpr, args) -> tuple[Program, list]:
-        """A function as a subprogram, and its arguments without what is known of them, which is compiled in."""
-        known = tuple(_find_known_entries(x) for x in args)
+        """A function as a subprogram, and its arguments without the known ones, which are compiled in."""
+        known = tuple(None if x.dtype.kind == "O" else (x.dtype.str, x.tobytes()) for x in args)
         program, has_rules = _subprogram(inner, known, self.graph.most)
         self.has_rules |= has_rules
         program, places = without_unread(program)
-        given = []
-        for x, of_x in zip(args, known, strict=True):
-            if isinstance(of_x, tuple):
-                entries = [y for y, z in zip(x.ravel().tolist(), of_x, strict=True) if z is None]
-                given.append(objects(entries, (len(entries),)))
-            elif of_x is None:
-                given.append(x)
+        given = [x for x in args if x.dtype.kind == "O"]
         return program, [given[i] for i in places]
 
     def _repair(self, results: list, program: Program, again, args) -> list:
@@ -352,27 +346,6 @@ def _innermost(inner: ClosedJaxpr, args: Sequence, again, given: Sequence) -> tu
     return _innermost(params["call"], args, params["again"], args)
 
 
-def _find_known_entries(x: np.ndarray) -> bytes | tuple | None:
-    """The type and bytes of a known array; of another one its zeros and ones, None in all other places, or None without any."""
-    if x.dtype.kind != "O":
-        return f"{x.dtype.str} ".encode() + x.tobytes()
-    # Other known numbers are passed: a function that is called with several of them is compiled once.
-    entries = [None if type(y) is Number or y not in (0, 1, -1) else y for y in x.ravel().tolist()]
-    # As texts, which tell zeros of both signs apart.
-    texts = tuple(
-        [None if y is None else "-0" if y == 0 and math.copysign(1.0, y) < 0 else str(int(y)) for y in entries]
-    )
-    return texts if any(y is not None for y in texts) else None
-
-
-def _join_entries(x: np.ndarray, known: tuple | None, array: Array) -> np.ndarray:
-    """An array of entries that are given, and of those that `_find_known_entries` knows."""
-    if known is None:
-        return x
-    kind, unknown = kind_or_refuse(array.dtype), iter(x.tolist())
-    return objects([next(unknown) if y is None else as_kind(float(y), kind) for y in known], array.shape)
-
-
 def _arrays_of(variables: Any) -> list[Array]:
     """Shapes and dtypes of variables of a jaxpr."""
     return [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in variables]
@@ -382,8 +355,8 @@ def _arrays_of(variables: Any) -> list[Array]:
 def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, bool]:
     """The program of a function that others call, and whether it has rules.
 
-    `known`: what `_find_known_entries` says of the arguments. Where numbers may be flagged, there is one more output, which says
-    whether one is.
+    `known`: dtypes and bytes of the arguments that are known, None for others. Where numbers may be flagged, there is one more
+    output, which says whether one is.
     """
     # By the identity of the jaxpr, which JAX keeps for a function under `jit`: of all calls of a function one program is made.
     graph = Graph(most)
@@ -391,12 +364,11 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
     # A subprogram makes no calls of its own but branches: only programs that have both call it.
     expansion, inputs, args = _Expansion(graph, False, True), [], []
     for array, x in zip(arrays, known, strict=True):
-        if isinstance(x, bytes):
-            kind, _, data = x.partition(b" ")
-            args.append(np.frombuffer(data, kind.decode()).reshape(array.shape))
-            continue
-        inputs.append(array if x is None else Array((x.count(None),), array.dtype))
-        args.append(_join_entries(graph.inputs(len(inputs) - 1, inputs[-1]), x, array))
+        if x is None:
+            args.append(graph.inputs(len(inputs), array))
+            inputs.append(array)
+        else:
+            args.append(np.frombuffer(x[1], x[0]).reshape(array.shape))
     results = [as_objects(x) for x in expansion.evaluate(inner, args)]
     outputs = _arrays_of(inner.jaxpr.outvars)
     if expansion.flagged is not False:

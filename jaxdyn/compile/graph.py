@@ -6,7 +6,6 @@ Each has its comment "Listed" here. What no output needs is dropped when a graph
 """
 
 import functools
-import itertools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -329,31 +328,6 @@ class Graph:
 
     # --- finishing ---
 
-    def _drop_results(self, live: Sequence[Number]) -> None:
-        """Let loops compute those of their outputs alone that are live."""
-        needed: dict[Number, set] = {}
-        for number in live:
-            if number.op == "part" and number.args[0].op == "call":
-                needed.setdefault(number.args[0], set()).add(number.args[1])
-        for call, parts in needed.items():
-            called: Any = self.subprograms[call.args[0]]
-            if not hasattr(called, "with_outputs"):
-                continue
-            ends = [0, *itertools.accumulate(x.size for x in called.outputs)]
-            flags = [any(k in parts for k in range(a, b)) for a, b in itertools.pairwise(ends)]
-            few = called.with_outputs(tuple(flags))
-            if len(few.outputs) < len(called.outputs):
-                kept = [i < called.counts.carries or flag for i, flag in enumerate(flags)]
-                places = [k for i, (a, b) in enumerate(itertools.pairwise(ends)) if kept[i] for k in range(a, b)]
-                at = {k: i for i, k in enumerate(places)}
-                which = self.numbers_of_subprograms.setdefault(few.digest, len(self.subprograms))
-                if which == len(self.subprograms):
-                    self.subprograms.append(few)
-                call.args = (which, *call.args[1:])
-                for number in live:
-                    if number.op == "part" and number.args[0] is call:
-                        number.args = (call, at[number.args[1]])
-
     def finish(
         self, inputs: Sequence[Array], outputs: Sequence[Array], entries: Sequence[np.ndarray], **more
     ) -> Program:
@@ -372,7 +346,6 @@ class Graph:
                     # Of what stands for the outputs of a branch, that alone which has a part is needed.
                     waiting.extend(self._inputs_of_branch(number) if number.op == "call_where" else number.args)
         live = [number for number in self.numbers if number.place is not None]
-        self._drop_results(live)
         operations: list[Operation] = []
         count = 0
         called: dict[int, int] = {}  # numbers of the subprograms that are still called, by those of the graph

@@ -17,7 +17,7 @@ from jaxdyn.compile import mode
 from jaxdyn.compile.body import MAX_STACK_BYTES
 from jaxdyn.compile.code import varying_first
 from jaxdyn.compile.primitive import kernel_p, target
-from jaxdyn.compile.program import Array
+from jaxdyn.compile.program import Array, Loops
 
 with contextlib.suppress(ImportError):  # no kernels without llvmlite
     import llvmlite.ir as ir
@@ -29,16 +29,12 @@ _VECTOR_BYTES = 64  # of the longest vectors; processors with shorter ones take 
 _VECTORS_AT_ONCE = 6
 
 
-class MatrixProgram:
+class MatrixProgram(Loops):
     """The kernel of a matrix (rows, columns) -> one matrix of the shape `result`. Subclasses write it, and say its `cost`.
 
     `other`: the shape of a second matrix that it takes, or None.
     """
 
-    derivative = fallback = None
-    subprograms = ()
-    turns = 1
-    is_called = is_kept = True
     name: str
     cost: int
 
@@ -56,17 +52,6 @@ class MatrixProgram:
         self.inputs, self.outputs = tuple(Array(x, self.dtype) for x in shapes), (Array(result, self.dtype),)
         self.results = (tuple(range(self.outputs[0].size)),)
         self.derived: dict = {}
-
-    def __getstate__(self):
-        return vars(self) | {"derived": {}}
-
-    def describe(self) -> "MatrixProgram":
-        """Itself, as what is kept of it on disk (see `stored`)."""
-        return self
-
-    def restore(self, remake) -> "MatrixProgram":
-        """The program of what is kept."""
-        return self
 
     @property
     def title(self) -> str:

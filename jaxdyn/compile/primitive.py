@@ -16,13 +16,15 @@ from jax import lax
 
 from jaxdyn.compile import derive, jax_adapter, mode
 from jaxdyn.compile.careful import guard
-from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.operations import as_operations, by_jax
 from jaxdyn.compile.program import Array, Constant, NotNumbers, Operation, Program, TooLong, derived, dtype_of
 from jaxdyn.compile.rules import change_along, mark_invalid
 from jaxdyn.compile.stored import key_within, load_or_make
 from jaxdyn.compile.trace import tangent_program
+
+# Fewer operations are not worth a second call: they are carried out for each block of samples.
+MIN_SHARED_OPERATIONS = 2000
 
 try:
     from jaxdyn.compile import target

@@ -134,6 +134,26 @@ class Program:
         return counts_by_kind
 
 
+class Loops:
+    """Code with loops, which stands where a `Program` does and which others only call; it is kept on disk as it is."""
+
+    derivative = fallback = None
+    turns = 1
+    is_called = is_kept = True
+    subprograms: Sequence = ()
+
+    def __getstate__(self):
+        return vars(self) | {"derived": {}}
+
+    def describe(self) -> "Loops":
+        """Itself, as what is kept of it on disk (see `stored`)."""
+        return self
+
+    def restore(self, remake) -> "Loops":
+        """The same of what is kept."""
+        return self
+
+
 def derived(make: Callable) -> Callable:
     """Keep what a function derives from a program and hashable arguments, for as long as the program lives; a decorator."""
 

@@ -1,11 +1,11 @@
 """Loops of jaxprs as `scan.Scan`s: the program of one iteration, from the arrays that go into all of them.
 
 What is known is folded into it: entries of carries that never change, and columns of rows that are the same in all iterations,
-such as the zeros of joints of one kind. Other known columns are tables. Entries that are always equal, such as those of a
-symmetric matrix, are one entry.
+such as the zeros of joints of one kind. Other known columns are tables.
 """
 
 import contextlib
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -76,7 +76,7 @@ def _roll(expansion, body: ClosedJaxpr, arrays, eqn, length: int, inward: bool, 
     of_results = [x.aval.dtype for x in eqn.outvars[len(carries) :]]
     consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, of_consts, strict=True)]
     rows = [_group(_columns(x), x[0, ...], d) for x, d in zip(rows, of_rows, strict=True)]
-    classes = _Classes([as_objects(x) for x in carries], of_carries)
+    carried = _Carries([as_objects(x) for x in carries], of_carries)
     while True:
         inner, types = Graph(expansion.graph.most), []
 
@@ -86,43 +86,42 @@ def _roll(expansion, body: ClosedJaxpr, arrays, eqn, length: int, inward: bool, 
             return [inner.inputs(first + i, x) for i, x in enumerate(arrays)]
 
         own_consts = make([Array((len(x.passed),), x.dtype) for x in consts if x.passed])
-        own_carries = make(classes.types)
+        own_carries = make(carried.types)
         own_rows = make([Array((len(x.passed),), x.dtype) for x in rows if x.passed])
         own_tables = make([Array((len(x.known),), x.dtype) for x in rows if x.known])
         of_constants, of_passed, of_known = iter(own_consts), iter(own_rows), iter(own_tables)
         given = [
             *(x.entries(of_constants, None) for x in consts),
-            *classes.entries(own_carries),
+            *carried.entries(own_carries),
             *(x.entries(of_passed, of_known) for x in rows),
         ]
         results = [as_objects(x) for x in expansion.evaluate_in(inner, body, given)]
         ends, outs = results[: len(carries)], results[len(carries) :]
-        if not classes.refine(ends):
+        if not carried.refine(ends):
             break
-    distinct = [_distinct(x.ravel().tolist()) for x in outs]
-    carried = classes.outputs(ends)
-    kept = [i for i, (first, _) in enumerate(distinct) if first]
-    made = [objects([outs[i].ravel()[k] for k in distinct[i][0]], (len(distinct[i][0]),)) for i in kept]
-    outputs = [*classes.types, *(Array(x.shape, np.dtype(of_results[i])) for i, x in zip(kept, made, strict=True))]
-    program = inner.finish(types, outputs, [*carried, *made])
+    # Of each array of rows the columns that are not known.
+    columns = [[k for k, x in enumerate(out.ravel().tolist()) if is_number(x)] for out in outs]
+    kept = [i for i, column in enumerate(columns) if column]
+    made = [outs[i].ravel()[columns[i]] for i in kept]
+    outputs = [*carried.types, *(Array(x.shape, np.dtype(of_results[i])) for i, x in zip(kept, made, strict=True))]
+    program = inner.finish(types, outputs, [*carried.outputs(ends), *made])
     # A call counts as one operation: its code exists once. A loop of long iterations would compile for as long as what is written
     # out, which then is refused as too long.
     if len(program.operations) * length <= most or (most and len(program.operations) > MAX_LOOP_BODY):
         return None
     tables = [np.stack([np.array(y, x.dtype) for y in x.known], 1) for x in rows if x.known]
-    counts = Counts(len(own_consts), len(carried), len(own_rows), len(tables), 0, len(kept))
+    counts = Counts(len(own_consts), len(own_carries), len(own_rows), len(tables), 0, len(kept))
     scan = Scan(program, counts, length, tables, inward, parents)
     passed = [np.stack([objects(y, (len(y),)) for y in x.passed], 1) for x in rows if x.passed]
     consts = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
-    found = scan.call(expansion.graph, [*consts, *classes.starts(), *passed])
-    by_place = dict(zip(kept, found[len(carried) :], strict=True))
-    stacked = []
-    for i, (out, (_, places)) in enumerate(zip(outs, distinct, strict=True)):
-        full = np.empty((length, out.size), object)
-        for k, (x, place) in enumerate(zip(out.ravel().tolist(), places, strict=True)):
-            full[:, k] = x if place is None else by_place[i][:, place]
+    found = expansion.graph.call(scan, [*consts, *carried.starts(), *passed])
+    stacked, of_columns = [], iter(found[len(own_carries) :])
+    for out, column in zip(outs, columns, strict=True):
+        full = np.tile(out.ravel(), (length, 1))
+        if column:
+            full[:, column] = next(of_columns)
         stacked.append(full.reshape(length, *out.shape))
-    return [*classes.entries(found[: len(carried)]), *stacked]
+    return [*carried.entries(found[: len(own_carries)]), *stacked]
 
 
 def sweep(expansion, params, args, eqn):
@@ -174,50 +173,35 @@ def _roll_while(expansion, params, arrays: Sequence[Sequence], eqn) -> list:
     types = [x.aval.dtype for x in eqn.invars]
     consts = [*of_cond, *of_body]
     consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, types, strict=False)]
-    classes = _Classes([as_objects(x) for x in carries], types[len(consts) :])
+    carried = _Carries([as_objects(x) for x in carries], types[len(consts) :])
 
     def start():
         """A graph, the types of its inputs, constants and carries."""
         inner = Graph(expansion.graph.most)
-        types = [*(Array((len(x.passed),), x.dtype) for x in consts if x.passed), *classes.types]
+        types = [*(Array((len(x.passed),), x.dtype) for x in consts if x.passed), *carried.types]
         made = [inner.inputs(i, x) for i, x in enumerate(types)]
-        count = len(types) - len(classes.types)
+        count = len(types) - len(carried.types)
         of_constants = iter(made[:count])
-        return inner, types, [x.entries(of_constants, None) for x in consts], classes.entries(made[count:])
+        return inner, types, [x.entries(of_constants, None) for x in consts], carried.entries(made[count:])
 
     while True:
         inner, types, own, own_carries = start()
         given = [*own[len(of_cond) :], *own_carries]
         ends = [as_objects(x) for x in expansion.evaluate_in(inner, params["body_jaxpr"], given)]
-        if not classes.refine(ends):
+        if not carried.refine(ends):
             break
-    program = inner.finish(types, classes.types, classes.outputs(ends))
+    program = inner.finish(types, carried.types, carried.outputs(ends))
     inner, types, own, own_carries = start()
     (going,) = expansion.evaluate_in(inner, params["cond_jaxpr"], [*own[: len(of_cond)], *own_carries])
     until = inner.finish(types, [Array((), np.dtype(bool))], [as_objects(going)])
     passed = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
-    counts = Counts(len(passed), len(classes.types), 0, 0, 0, 0)
+    counts = Counts(len(passed), len(carried.types), 0, 0, 0, 0)
     scan = Scan(program, counts, GUESSED_ITERATIONS, condition=until)
-    return classes.entries(scan.call(expansion.graph, [*passed, *classes.starts()]))
+    return carried.entries(expansion.graph.call(scan, [*passed, *carried.starts()]))
 
 
 def _add(expansion, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return as_objects(expansion.elementwise["add"](as_objects(x), as_objects(y)))
-
-
-def _distinct(entries: list) -> tuple[list[int], list[int | None]]:
-    """Places of the first of equal entries that are not known; for each entry its place among these, None where known."""
-    found: dict[int, int] = {}
-    first, places = [], []
-    for k, x in enumerate(entries):
-        if not is_number(x):
-            places.append(None)
-            continue
-        if id(x) not in found:
-            found[id(x)] = len(first)
-            first.append(k)
-        places.append(found[id(x)])
-    return first, places
 
 
 # --- constants and rows ---
@@ -272,56 +256,44 @@ def _group(columns: list[list], one: np.ndarray, dtype) -> _Group:
 # --- carries ---
 
 
-class _Classes:
-    """Entries of carries in classes of equal ones, found by refinement: entries that start equal and are computed alike.
-
-    A class whose start is known and which keeps it is no carry at all.
-    """
+class _Carries:
+    """Entries of carries. One whose start is known and which keeps it is no carry at all."""
 
     def __init__(self, carries: Sequence[np.ndarray], dtypes: Sequence):
         self.shapes = [x.shape for x in carries]
         # Each array of carries is one of the loop: derivatives decide by arrays what they depend on.
         self.owners = [i for i, x in enumerate(carries) for _ in range(x.size)]
-        self.kinds = [kind_or_refuse(d) for d, x in zip(dtypes, carries, strict=True) for _ in range(x.size)]
+        self.kinds = [kind_or_refuse(d) for d in dtypes]
         self.start = [x for array in carries for x in array.ravel().tolist()]
         self.known = [not is_number(x) for x in self.start]
-        self.keys: list[Any] = [(kind, _key(x)) for kind, x in zip(self.kinds, self.start, strict=True)]
 
     def _members(self) -> dict[int, list[int]]:
-        """First entries of the classes that are carried, by array."""
-        seen, members = set(), {}
-        for i, (key, known, owner) in enumerate(zip(self.keys, self.known, self.owners, strict=True)):
-            if not known and key not in seen:
-                seen.add(key)
+        """Entries that are carried, by array."""
+        members: dict[int, list[int]] = {}
+        for i, owner in enumerate(self.owners):
+            if not self.known[i]:
                 members.setdefault(owner, []).append(i)
         return members
 
     @property
     def types(self) -> list[Array]:
         """Arrays of the carried entries."""
-        return [Array((len(x),), dtype_of(self.kinds[x[0]])) for x in self._members().values()]
+        return [Array((len(x),), dtype_of(self.kinds[owner])) for owner, x in self._members().items()]
 
     def entries(self, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Arrays of the carries from their classes' values."""
-        value = {
-            self.keys[i]: x
-            for members, array in zip(self._members().values(), inputs, strict=True)
-            for i, x in zip(members, array.ravel().tolist(), strict=True)
-        }
-        flat = iter([s if k else value[key] for s, k, key in zip(self.start, self.known, self.keys, strict=True)])
-        return [objects([next(flat) for _ in range(int(np.prod(shape)))], shape) for shape in self.shapes]
+        """Arrays of the carries from those of the carried entries."""
+        flat = list(self.start)
+        for members, array in zip(self._members().values(), inputs, strict=True):
+            for i, x in zip(members, array.ravel().tolist(), strict=True):
+                flat[i] = x
+        parts = split_by_counts(flat, [math.prod(shape) for shape in self.shapes])
+        return [objects(part, shape) for part, shape in zip(parts, self.shapes, strict=True)]
 
     def refine(self, ends: Sequence[np.ndarray]) -> bool:
-        """Divide classes whose entries were computed differently; False where none were."""
-        made = [_key(x) for array in ends for x in array.ravel().tolist()]
-        known = [k and _key(s) == m for k, s, m in zip(self.known, self.start, made, strict=True)]
-        keys = [key if k else (key, m) for key, k, m in zip(self.keys, known, made, strict=True)]
-        before = len(set(zip(self.keys, self.known, strict=True)))
-        changed = known != self.known or len(set(zip(keys, known, strict=True))) != before
-        if changed:
-            names: dict[Any, int] = {}
-            self.known = known
-            self.keys = [names.setdefault((key, k), len(names)) for key, k in zip(keys, known, strict=True)]
+        """Carry entries that an iteration has changed; False where none were."""
+        made = [x for array in ends for x in array.ravel().tolist()]
+        known = [k and _key(x) == _key(y) for k, x, y in zip(self.known, self.start, made, strict=True)]
+        changed, self.known = known != self.known, known
         return changed
 
     def outputs(self, ends: Sequence[np.ndarray]) -> list[np.ndarray]:

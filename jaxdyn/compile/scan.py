@@ -24,7 +24,7 @@ from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.code import ATTRIBUTES, ScanText
 from jaxdyn.compile.derive import arrays_of, replay
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.program import Array, Constant, Program, as_objects, derived, is_number, split_by_counts
+from jaxdyn.compile.program import Array, Constant, Loops, Program, as_objects, derived, is_number, split_by_counts
 
 # Operations beyond which a loop is not written out. LLVM takes some 50 microseconds for each: one second.
 MAX_WRITTEN_OUT = 20_000
@@ -41,7 +41,7 @@ class Counts(NamedTuple):
     results: int
 
 
-class Scan:
+class Scan(Loops):
     """A loop as a subprogram; it stands where a `Program` does.
 
     - `body`: the program of an iteration. Its inputs are constants, carries, one row of each array, and one of each table; its
@@ -55,9 +55,6 @@ class Scan:
     Outputs are carries (of the last iteration; inward, of the root), sums, and arrays of rows.
     """
 
-    derivative = fallback = None
-    turns = 1
-    is_called = is_kept = True
     keeps_arrays = True  # in memory, where the next loop reads them
     name = "scan"
 
@@ -83,40 +80,6 @@ class Scan:
         """Carries, terms of sums and rows among the outputs of the body."""
         return split_by_counts(values, (self.counts.carries, self.counts.sums, self.counts.results))
 
-    def call(self, graph: Graph, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The outputs of a call with these inputs, of which those are passed that the body reads."""
-        few, places = self._with_read_inputs()
-        return graph.call(few, [arrays[i] for i in places])
-
-    @derived
-    def _with_read_inputs(self) -> tuple["Scan", list[int]]:
-        if self.condition is not None:
-            return self, list(range(len(self.inputs)))
-        read = {args[0] for op, _, args in self.body.operations if op == "input"}
-        consts, carries, rows, tables = self.split_inputs(range(len(self.body.inputs)))
-        kept = [
-            [i for i in consts if i in read],
-            carries,
-            [i for i in rows if i in read],
-            [i for i in tables if i in read],
-        ]
-        if sum(map(len, kept)) == len(self.body.inputs):
-            return self, list(range(len(self.inputs)))
-        body = rewrite(self.body, [i for group in kept for i in group], range(len(self.body.outputs)))
-        counts = self.counts._replace(consts=len(kept[0]), rows=len(kept[2]), tables=len(kept[3]))
-        tables = [self.tables[i - tables[0]] for i in kept[3]]
-        return Scan(body, counts, self.length, tables, self.inward, self.parents), [
-            i for group in kept[:3] for i in group
-        ]
-
-    @derived
-    def with_outputs(self, needed: tuple[bool, ...]) -> "Scan":
-        """The scan of its carries and of those of its other outputs that are needed."""
-        kept = [i for i, flag in enumerate(needed) if flag or i < self.counts.carries]
-        _, sums, results = self.split_outputs(needed)
-        body = rewrite(self.body, range(len(self.body.inputs)), kept)
-        return self._like(body, self.counts._replace(sums=sum(sums), results=sum(results)))
-
     @property
     def subprograms(self) -> tuple:
         """Loops within the body."""
@@ -131,19 +94,6 @@ class Scan:
         until = "" if self.condition is None else self.condition.digest
         text = f"{until} {self.body.digest} {self.counts} {self.length} {tables} {self.inward} {self.parents}"
         return hashlib.sha256(text.encode()).hexdigest()
-
-    # --- on disk ---
-
-    def __getstate__(self):
-        return vars(self) | {"derived": {}}
-
-    def describe(self) -> "Scan":
-        """Itself, as what is kept of it on disk (see `stored`)."""
-        return self
-
-    def restore(self, remake) -> "Scan":
-        """The scan of what is kept."""
-        return self
 
     # --- text ---
 
@@ -173,7 +123,7 @@ class Scan:
         moving = tuple(any(is_number(x) or x != 0 for x in step.flat) for step in steps)
         tangent, moves = self._tangent(moving)
         groups = zip(*(split_by_counts(x, self.counts[:3]) for x in (arrays, steps, moves[: len(arrays)])), strict=True)
-        made = iter(tangent.call(graph, [x for group in groups for x in with_changes(*group)]))
+        made = iter(graph.call(tangent, [x for group in groups for x in with_changes(*group)]))
         outs, out_steps = [], []
         for flags in split_by_counts(
             moves[len(arrays) :], (self.counts.carries, self.counts.sums, self.counts.results)
@@ -315,7 +265,7 @@ class TransposedCall:
             split_by_counts(x, scan.counts[:3]) for x in (self.linear, arrays)
         )
         self.consts, rows = where_flag(consts, l_consts, False), where_flag(rows, l_rows, False)
-        made = self.parts.fixed.call(graph, [*self.consts, *where_flag(carries, self.parts.carries, False), *rows])
+        made = graph.call(self.parts.fixed, [*self.consts, *where_flag(carries, self.parts.carries, False), *rows])
         count = self.parts.carries.count(False)
         own, saved = iter(made[: len(made) - count]), made[len(made) - count :]
         self.rows = [*rows, *saved]
@@ -329,7 +279,7 @@ class TransposedCall:
         c, s, y = parts.rest.counts.carries, parts.rest.counts.sums, parts.rest.counts.results
         carries, sums, rows = split_by_counts(where_flag(arrays_of(scan.outputs, given), parts.outputs), (c, s, y))
         backwards = parts.rest.transpose(parts.linear)
-        made = backwards.call(self.graph, [*self.consts, *sums, *carries, *self.rows, *rows])
+        made = self.graph.call(backwards, [*self.consts, *sums, *carries, *self.rows, *rows])
         of_carries, of_consts, of_rows = map(
             iter, split_by_counts(made, (c, backwards.counts.sums, backwards.counts.results))
         )

@@ -15,7 +15,7 @@ import numpy as np
 from jaxdyn.compile import disk, mode, stored
 from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.careful import CAREFUL, Careful, identity_of, number_of, run_apart
-from jaxdyn.compile.code import calls_itself, has_table, kernel_ir, subprogram_ir, varying_first
+from jaxdyn.compile.code import has_table, kernel_ir, subprogram_ir, varying_first
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.mode import optimise_later, phase
@@ -265,18 +265,18 @@ class _Kernel:
         width, found, is_new = self.row.width, stored.find_code(identity), False
         if found is None and program is None:
             return False
-        calls, careful = _calls(_subprograms_of_kernel(program, width), width)
+        calls, careful = _calls(() if program is None else program.subprograms, width)
         _restore_careful(() if found is None else found.careful, self._recover_careful)
         for symbol in calls if found is None else found.calls:
             if not _publish(symbol, width, calls, self._recover_careful):
                 return False
         if found is None:
+            assert program is not None
             is_program, uniform = isinstance(program, Program), self.uniform or [False] * len(program.inputs)
             write = partial(kernel_ir, program, width, uniform) if is_program else partial(program.ir, width, uniform)
             # A loop may run for long, and quick code of vectors takes four times as long, that of single numbers a quarter more.
             quick_width = 0 if program.turns > 1 and width > 1 else width
-            is_call = is_program and calls_itself(program, width)
-            quick = None if is_call else _write_quick(program, quick_width, write)
+            quick = _write_quick(program, quick_width, write)
             found = stored.make_code(identity, write, tuple(calls), careful, program.name, quick_width, quick)
             is_new = True
         _install(found, identity, "kernel", partial(setattr, self.entry, "kernel"), is_new)
@@ -289,14 +289,6 @@ class _Kernel:
             self.recover()
         if self.careful is not None:
             _enter_careful(self.careful.program())
-
-
-def _subprograms_of_kernel(program, width: int) -> Sequence:
-    if program is None:
-        return ()
-    if isinstance(program, Program) and calls_itself(program, width):
-        return (program.fast or program, *program.subprograms)
-    return program.subprograms
 
 
 def _calls(called: Sequence, width: int) -> tuple[dict[str, Any], list[tuple[int, Row]]]:

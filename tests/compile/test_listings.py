@@ -10,7 +10,7 @@ from jax import lax
 
 import jaxdyn as jd
 from jaxdyn.compile import rolled, stored, target
-from jaxdyn.compile.code import calls_itself, has_table, kernel_ir, subprogram_ir, varying_first
+from jaxdyn.compile.code import has_table, kernel_ir, varying_first
 from jaxdyn.compile.derive import tangent, transpose
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.trace import program_of
@@ -29,21 +29,12 @@ def program(function, *args, **how) -> Program:
 
 def compute(of: Program, width: int, uniform, arrays, is_listed: bool) -> list[np.ndarray]:
     """Results of a kernel whose operations are code, or data."""
-    called = target._calls(target._subprograms_of_kernel(of, width), width)[0]
+    called = target._calls(of.subprograms, width)[0]
     for symbol in called:
         assert target._publish(symbol, width, called)
-    text = kernel_ir(of, width, uniform, is_listed)
-    if calls_itself(of, width):
-        text = None
-    code = stored.Code(stored.compile_text(text or subprogram_ir(of, width, is_listed)))
+    code = stored.Code(stored.compile_text(kernel_ir(of, width, uniform, is_listed)))
     results = [np.zeros((SAMPLES, x.size), x.dtype) for x in of.outputs]
     order = varying_first(uniform)
-    if text is None:
-        function = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * (len(arrays) + len(results)))(code.address("called"))
-        for i in range(SAMPLES):
-            rows = [x if same else x[i] for x, same in zip(arrays, uniform, strict=True)] + [x[i] for x in results]
-            function(*(x.ctypes.data for x in rows))
-        return results
     rows = [*(arrays[i] for i in order), *results]
     data = (ctypes.c_void_p * len(rows))(*(x.ctypes.data for x in rows))
     function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(

@@ -101,16 +101,13 @@ def module_ir(program, uniform: Sequence[bool]) -> str:
         program = as_call(program)
     text = kernel_ir(program, 1, uniform) if isinstance(program, Program) else program.ir(1, uniform)
     parts = _parts(text.replace("define void @kernel(", "define internal void @kernel(").replace("#0 {", "#2 {", 1))
-    called = list(program.subprograms)
-    if isinstance(program, Program):
-        called.append(program)  # which a large kernel calls
-    _define(parts, called)
+    _define(parts, program.subprograms)
     thread = _thread_ir(program, uniform)
     _add(parts, thread)
     parts["attributes #2"] = 'attributes #2 = { alwaysinline nounwind "no-builtins" }'
     # LLVM writes functions out that are called once: what is passed stays in registers.
     text = "\n".join(parts.values())
-    for symbol in (symbol_of(x, 1) for x in called):
+    for symbol in (symbol_of(x, 1) for x in program.subprograms):
         if symbol in parts and text.count(f"call void @{symbol}(") == 1:
             parts[symbol] = parts[symbol].replace(" #0 {", " #2 {", 1)
     text = "\n".join(parts.values())
