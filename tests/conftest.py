@@ -22,6 +22,9 @@ if os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "least" and "XLA_FLAGS" not i
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ["XLA_FLAGS"] = " ".join(flags)
 
+# A worker for each core: threads of OpenBLAS, which wait in loops, take the time of the others.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import jaxtyping
 import pytest

@@ -36,10 +36,9 @@ from jaxdyn.cli.identify_options import (
 from jaxdyn.cli.identify_tables import error_table, gains_text, mechanism_text, payload_text, tables
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
-from jaxdyn.identify.applied_fits import fit_mechanism
 from jaxdyn.identify.descent import on_one_thread
-from jaxdyn.identify.linear_fit import base_terms
-from jaxdyn.identify.raw_logs import check_log_content, check_rest, vibration
+from jaxdyn.identify.linear_fit import base_terms, fit_mechanism
+from jaxdyn.identify.raw_logs import log_warnings, vibration
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.io import save_urdf
 from jaxdyn.io.loaded import LoadedScene
@@ -295,16 +294,12 @@ def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[E
 
 def _warnings(findings: Findings) -> list[str]:
     lines = []
-    labels = columns_of(findings.model).v
     # After a refit the held-out parts are among the training logs already.
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
-        lines += [f"{one.name}: {line}" for line in check_log_content(findings.model, one.log, labels)]
-        # Residuals are checked too: drift at rest points to friction or offsets that the model lacks.
-        lines += [
-            f"{one.name}: {line}" for line in check_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)
-        ]
+        residual = one.predicted - np.asarray(one.log.tau)
+        lines += [f"{one.name}: {line}" for line in log_warnings(findings.model, one.log, residual)]
         # Vibration above the cut-off has been filtered out and needs no advice.
-        share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
+        share, edge = vibration(one.log, residual)
         if share > _VIBRATES and (one.log.cutoff is None or edge < one.log.cutoff):
             fix = f"low-pass it at {edge:.2g} Hz" if one.log.cutoff is None else f"try --cutoff {edge:.2g}"
             lines.append(

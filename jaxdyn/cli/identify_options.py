@@ -287,18 +287,12 @@ def make_fit(
     if options.method == "least-squares":
         return identify.least_squares(model, logs, options.terms, v_s=float(options.v_s))
     if options.method == "feasible":
-        return identify.fit_robot(
-            model,
-            logs,
-            options.terms,
-            v_s=options.v_s,
-            prior=options.prior,
-            robust=options.robust,
-            weights=options.weights,
-            delay=options.delay,
-            client=client,
-            callback=tell,
-        )
+        chosen = options._asdict()
+        del chosen["method"]
+        with warnings.catch_warnings():
+            # The command prints these lines itself, with the names of the files, and of the test logs too.
+            warnings.simplefilter("ignore", identify.LogWarning)
+            return identify.fit_robot(model, logs, **chosen, client=client, callback=tell)
     # One log alone, as the command has checked.
     (log,) = logs
     v_s = float(options.v_s)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxdyn.cli.common import short, table
 from jaxdyn.constraints.codes import is_successful, name_of
 from jaxdyn.identify import TERMS, Delays, DriveGains, LeastSquares, Log, Payload, RobotFit, nominal_parameters
-from jaxdyn.identify.applied_fits import MechanismFit
+from jaxdyn.identify.linear_fit import MechanismFit
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.model.configuration import columns_of

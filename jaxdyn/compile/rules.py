@@ -183,26 +183,27 @@ _nan_where_p = _define_flagged(
 # --- values whose derivatives exist in reverse mode alone ---
 
 
-def reverse_only(tree, message: str):
+def reverse_only(tree, message: str, *, first_order: bool = False):
     """The same values; forward mode through them raises ValueError with a message.
 
     JAX refuses forward mode through a function with a rule for reverse mode without saying what to do instead. A marked value
     passes reverse mode as it is. Its tangent is a primitive that reverse mode transposes away, and that cannot be computed.
+    Forward mode over reverse mode is refused only if `first_order`: most rules for reverse mode have derivatives of their own.
     """
     if _mark_p is None:
         return tree
-    return jax.tree.map(lambda x: _mark_p.bind(x, message=message) if hasattr(x, "dtype") and is_float(x) else x, tree)
+    of = {"message": message, "first_order": first_order}
+    return jax.tree.map(lambda x: _mark_p.bind(x, **of) if hasattr(x, "dtype") and is_float(x) else x, tree)
 
 
 def _refuse(*_, message: str) -> NoReturn:
     raise ValueError(message)
 
 
-def _mark_jvp(primals, tangents, *, message: str):
+def _mark_jvp(primals, tangents, *, message: str, first_order: bool):
     (x,), (tangent,) = primals, tangents
     moved = tangent if is_zero(tangent) or _tangent_p is None else _tangent_p.bind(tangent, message=message)
-    # Not marked again: forward mode over reverse mode differentiates the rule for reverse mode, which has derivatives of its own.
-    return x, moved
+    return _mark_p.bind(x, message=message, first_order=True) if first_order else x, moved
 
 
 def _tangent_jvp(primals, tangents, *, message: str):
@@ -213,10 +214,10 @@ def _tangent_jvp(primals, tangents, *, message: str):
 
 _mark_p = define_primitive(
     "jaxdyn_reverse_only",
-    lambda x, message: x,
-    implement=lambda x, message: x,
-    lower=lambda x, message: x,
-    batch=lambda arrays, axes, message: (_mark_p.bind(*arrays, message=message), axes[0]),
+    lambda x, **_: x,
+    implement=lambda x, **_: x,
+    lower=lambda x, **_: x,
+    batch=lambda arrays, axes, **of: (_mark_p.bind(*arrays, **of), axes[0]),
     jvp=_mark_jvp,
 )
 _tangent_p = define_primitive(

@@ -123,7 +123,9 @@ class RESULTS(metaclass=_Enumeration):
     open_constraints = _code("The constraints opened, and the projection could not close them.")
     contact_lost = _code("A contact pulled or left its friction cone.")
     joint_limit_passed = _code("A joint passed one of its position limits.")
-    control_singular = _code("The control came to where its task cannot be followed: task and constraints lose rank.")
+    control_singular = _code(
+        "The control came to where its task cannot be followed: task and constraints, or its motors, lose rank."
+    )
     too_many_events = _code("Events followed each other without end, or there were more than max_events.")
     painleve_paradox = _code(
         "Friction and normal force of a sliding contact left no forces, or more than one (Painleve's paradox)."

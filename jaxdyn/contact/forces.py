@@ -213,8 +213,9 @@ class ForceClosure(eqx.Module):
     r"""Force closure of a grasp: the decision, its margin, and a certificate where it fails.
 
     - `closed`: the decision. `margin`: the largest t such that internal forces f, $G f = 0$, with total normal force 1 N
-      have every margin of every cone at least t (for a friction cone $\mu f_n - |f_t|$, so t is dimensionless: newtons of
-      margin per newton of grip). Zero where the grasp is open, infinite where no contact has a bound.
+      have every margin of every cone at least t (for a friction cone $\mu f_n - |f_t|$, for a contact without friction its
+      normal force $f_n$; so t is dimensionless: newtons of margin per newton of grip). Zero where the grasp is open, infinite
+      where no contact has a bound.
     - `forces` (m,): those internal forces; zeros where there are none.
     - `direction` (p,): where open, a unit wrench on the object that contact forces cannot balance, in the units and
       axes of G's rows; zeros where closed. Its product with $G f$ is not negative (to 1e-8) for all forces f in the cones,

@@ -9,7 +9,7 @@ commands an acceleration for which the error decays,
 so that  d2e/dt2 + Kd de/dt + Kp e = 0  and  dw/dt + Kp w = 0.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -233,26 +233,39 @@ def drop_rounding(left: Array, whole: Array) -> Array:
     return jnp.where(sizes[0] > tolerance(None, whole) ** 2 * sizes[1], left, jnp.zeros_like(left))
 
 
-def regularity(system, q, t, A, T) -> Float[Array, ""]:
+def regularity(system, q, t, A, T, passive: Sequence[int] = ()) -> Float[Array, ""]:
     """Distance, 0 to 1, of the rows T (m, nv) of a task from dependence on each other and on constraints A (nc, nv).
 
     Defined as the least sine of the angle, in the metric M^-1, between a row of T and the span of A and the rows of T
-    before it.
+    before it. For each of the `passive` velocities, which no motor drives, also the sine of the angle, in the metric M, between
+    a motion of it alone and the span of the motions that A allows and of those of the passive velocities before it: where that
+    is zero, the mechanism moves with its motors at rest.
     """
-    metric = mass_factor(mass_matrix(system, q, t))
+    M = mass_matrix(system, q, t)
+    metric = mass_factor(M)
     Y, Z = metric.whiten(A.T), metric.whiten(T.T)
+    fixed = matmul(Y, pseudo_inverse(Y, tolerance(None, Y)))
     # What remains of a row without the span of the constraints measures its independence of them.
-    Z = Z - matmul(Y, matmul(pseudo_inverse(Y, tolerance(None, Y)), Z))
-    sizes = jnp.sum(metric.whiten(T.T) ** 2, 0)
-    free, least = list(Z.T), []
+    least = _squared_sines(Z - matmul(fixed, Z), Z)
+    if len(passive):
+        # U^T v = U^-1 M v has the length of the velocity v in the metric M.
+        idle = metric.whiten(M[:, np.array(passive, int)])
+        least += _squared_sines(matmul(fixed, idle), idle)
+    return safe_sqrt(jnp.min(jnp.stack(least)))
+
+
+def _squared_sines(left: Float[Array, "n m"], whole: Float[Array, "n m"]) -> list[Float[Array, ""]]:
+    """Squared length of each column of `left` without the span of those before it, over that of the same column of `whole`."""
+    sizes = jnp.sum(whole**2, 0)
+    free, squares = list(left.T), []
     # Gram-Schmidt by hand: every quotient is safe at zero, so that derivatives are finite at a singularity too.
     for i, row in enumerate(free):
         square = jnp.sum(row * row)
         some = square > 0
-        least.append(square / jnp.where(sizes[i] > 0, sizes[i], jnp.ones_like(square)))
+        squares.append(square / jnp.where(sizes[i] > 0, sizes[i], jnp.ones_like(square)))
         unit = row / jnp.sqrt(jnp.where(some, square, jnp.ones_like(square)))
         free[i + 1 :] = [other - jnp.sum(unit * other) * unit for other in free[i + 1 :]]
-    return safe_sqrt(jnp.min(jnp.stack(least)))
+    return squares
 
 
 def row_rank(matrix: Float[Array, "m n"]) -> Array:

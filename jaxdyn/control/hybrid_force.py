@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, rows
 from jaxdyn.constraints.dynamics import projections
@@ -35,6 +35,7 @@ from jaxdyn.control.errors import (
     gain,
     regularity,
     row_count,
+    row_rank,
     times,
 )
 from jaxdyn.control.motion import torque_for
@@ -70,15 +71,15 @@ class HybridForce(ForceLoop):
     - `kp`, `kd`: positive definite, numbers, (m,) or (m, m); 1/s^2 and 1/s, or 1/s for `kp` of velocities, without `kd`.
     - `force`: $\lambda_d$ (nc,), or a function of t; None for zero. `ki` (1/s): positive definite, or None for no
       integral action.
-    - `actuated`: indices of the actuated velocities; None: all. The torques of least norm are used that
-      give the motion.
+    - `actuated`: names of the driven joints, or indices of velocities; None: all. The torques of least norm are used that
+      give the motion, and where none do, because the mechanism moves with its motors at rest, those of least squares.
     - `internal` (na,), N m: torques that are added along directions that change only forces: with as many motors as
       degrees of freedom there are none. Forces are then not controlled, and `force` and `ki` must be omitted.
     - `least_regularity`: a number from 0 to 1. Where `regularity(q, v, t)` falls to it, a simulation ends with the code
       `control_singular` and the time. None: it continues, with the task followed in the least-squares sense.
 
     **Raises:** ValueError for a scene without constraints, gains that are not positive definite, gains or a task
-    inconsistent with `of`; (when called) for inconsistent shapes.
+    inconsistent with `of`, fewer motors than degrees of freedom; (when called) for inconsistent shapes.
 
     Source: EQUATIONS section 8 (the documents' law for holonomic and for nonholonomic constraints, and for fewer motors
     than joints); Murray, Li & Sastry (1994), section 6.4.
@@ -124,6 +125,12 @@ class HybridForce(ForceLoop):
             raise ValueError("internal is given without actuated; name the actuated velocities")
         if self.actuated is not None and not (self.force is None and self.ki is None):
             raise ValueError("force or ki is given with actuated, where forces follow from the motion; omit them")
+        if len(self._passive()) > row_count(self.scene):
+            # More velocities without motors than rows: some motion has all motors at rest.
+            raise ValueError(
+                f"actuated has {len(self.actuated or ())} of {self.scene.nv} velocities, and the constraints have "
+                f"{row_count(self.scene)} rows; name a motor for each degree of freedom"
+            )
         if self.internal is not None and self.internal.shape != (len(self.actuated or ()),):
             raise ValueError(f"internal has shape {self.internal.shape}; give one torque per motor of {self.actuated}")
 
@@ -132,14 +139,28 @@ class HybridForce(ForceLoop):
         return self._acceleration(q, v, jnp.asarray(t, q.dtype), jnp.zeros_like(v))
 
     def regularity(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, ""]:
-        """Distance of the law from a singularity of task and constraints, 1 to 0.
+        """Distance of the law from a singularity of task, constraints and motors, 1 to 0.
 
         The least sine of the angle, in the metric $M^{-1}$, between a row of the task and the span of the constraints' and
-        the rows of the task before it. Close to a singularity the law's accelerations grow as its inverse.
+        the rows of the task before it. Close to a singularity the law's accelerations grow as its inverse. With `actuated`
+        also the least sine of the angle, in the metric M, between a motion of one joint without motor and the span of the
+        motions that the constraints allow and of those of such joints before it. Where it is zero, motors at rest do not hold
+        the mechanism, and close to that the torques grow as its inverse.
         """
         t = jnp.asarray(t, q.dtype)
         (A, _), (T, _) = self._orders(q, v, t)
-        return regularity(self.scene.system, q, t, A, T)
+        return regularity(self.scene.system, q, t, A, T, self._passive())
+
+    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
+        """Decide whether task and constraints are independent, and motors at rest hold the mechanism, as the law requires."""
+        is_regular, passive = super().is_regular(q, v, t), np.array(self._passive(), int)
+        if not passive.size:
+            return is_regular
+        return is_regular & (row_rank(constraint_jacobian(self.scene, q, t)[:, passive].T) == passive.size)
+
+    def _passive(self) -> tuple[int, ...]:
+        """Indices of the velocities without motors."""
+        return () if self.actuated is None else tuple(i for i in range(self.scene.nv) if i not in self.actuated)
 
     def allowance(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""] | None:
         """Margin of `regularity` above the least one."""

@@ -3,11 +3,7 @@
 from types import ModuleType as _ModuleType
 from typing import Any as _Any
 
-from jaxdyn.identify.applied_fits import Payload as Payload
-from jaxdyn.identify.applied_fits import fit_payload as fit_payload
 from jaxdyn.identify.condensed_fit import Intervals as Intervals
-from jaxdyn.identify.drive_gains import DriveGains as DriveGains
-from jaxdyn.identify.drive_gains import fit_gains as fit_gains
 from jaxdyn.identify.excitation_search import Excitation as Excitation
 from jaxdyn.identify.excitation_search import exciting_motion as exciting_motion
 from jaxdyn.identify.geometry import GeometryFit as GeometryFit
@@ -29,6 +25,10 @@ from jaxdyn.identify.options import Solver as Solver
 from jaxdyn.identify.parameter_tree import Parameters as Parameters
 from jaxdyn.identify.parameters import fit_parameters as fit_parameters
 from jaxdyn.identify.parameters import parameter_error as parameter_error
+from jaxdyn.identify.payloads import DriveGains as DriveGains
+from jaxdyn.identify.payloads import Payload as Payload
+from jaxdyn.identify.payloads import fit_gains as fit_gains
+from jaxdyn.identify.payloads import fit_payload as fit_payload
 from jaxdyn.identify.raw_logs import Cutoff as Cutoff
 from jaxdyn.identify.raw_logs import choose_cutoff as choose_cutoff
 from jaxdyn.identify.raw_logs import from_raw as from_raw

@@ -134,7 +134,7 @@ def make_chart(model: Model, inertia: str, bodies=None) -> Chart:
             "a feasible fit cannot start there; repair it first with jd.model.repair_inertias(model), give rods and points "
             "some thickness, or fit inertia='mass' alone"
         )
-    factors = np.array([_factor(P, inertia) for P in matrices]).reshape(-1, 4, 4)
+    factors = np.array([pseudo_factor(P, inertia) for P in matrices]).reshape(-1, 4, 4)
     return Chart(jnp.asarray(factors, np.dtype(model.home.dtype)), model.inertias, bodies, inertia)
 
 
@@ -145,7 +145,7 @@ def _is_feasible(matrix: np.ndarray, inertia: str) -> bool:
     return bool(values[0] > (1e-14 if inertia == "full" else -1e-9) * values[-1])
 
 
-def _factor(matrix: np.ndarray, inertia: str) -> np.ndarray:
+def pseudo_factor(matrix: np.ndarray, inertia: str) -> np.ndarray:
     """U0 with U0 U0^T = P0: upper triangular, or any root where the density alone is fitted."""
     if inertia == "full":
         # LAPACK's factor is lower triangular; of the reversed matrix, and reversed back, it is upper.

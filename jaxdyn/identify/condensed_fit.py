@@ -24,12 +24,11 @@ from jaxdyn.identify.regression import (
     Blocks,
     base_parameters,
     condense_model,
-    condense_rows,
     coordinate_names,
     free_columns,
     noise_level,
-    pad_triangle,
     parameter_names,
+    triangle_of,
 )
 from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_through_filter, term_columns
 from jaxdyn.identify.uncertainty import depends_on, jackknife, null_space, psd_root
@@ -118,10 +117,11 @@ def gather(
     loads: Sequence[np.ndarray],
     blocks: int,
     weights: Sequence[np.ndarray] | None = None,
+    carried: Sequence[np.ndarray] = (),
 ) -> Data:
     """Condense logs with the columns of extra terms; `loads` (n, nv) of each log is the torque of the rigid bodies.
 
-    `weights` (n, nv) of each log: of single torques, ones by default.
+    `weights` (n, nv) of each log: of single torques, ones by default; `carried` as of `condense_model`.
     """
     # Every candidate term is condensed once; a setting then selects columns, and needs no sample.
     parts = [[term_columns([term], log, load, v_s) for term in extra] for log, load in zip(logs, loads, strict=True)]
@@ -136,7 +136,9 @@ def gather(
     # A torque that is always zero borrows the scale of the largest, so that its coefficients keep a finite unit.
     torque = np.where(torque > 0, torque, torque.max(initial=0) or 1.0)
     units = np.where(size > 0, _UNIT * torque / np.where(size > 0, size, 1), 0.0)
-    data = condense_model(model, logs, v_s=v_s, coulomb=coulomb, extra=columns, blocks=blocks, weights=weights)
+    data = condense_model(
+        model, logs, v_s=v_s, coulomb=coulomb, extra=columns, carried=carried, blocks=blocks, weights=weights
+    )
     return Data(data, 10 * model.nb + 4 * model.nv, counts, units)
 
 
@@ -163,23 +165,21 @@ def fit_blocks(
     places = data.places(setting.extra)
     kept = np.append(np.arange(data.basic), places)
     # Coefficients first, so that their elimination is the top of the triangle.
-    free = condense_rows(rows[:, [*places, *range(data.basic), size]], count)
-    spare = count - free.R.shape[1]
+    free = triangle_of(rows[:, [*places, *range(data.basic), size]])
+    spare = count - (free.shape[1] - 1)
+    rest = float(free[-1, -1] ** 2) if len(free) == free.shape[1] else 0.0
     # Dependent columns make this estimate a little too small, alike for all settings that are compared.
-    if is_rough and spare > 0 and free.rest > 0:
-        sigma = np.sqrt(free.rest / spare)
+    if is_rough and spare > 0 and rest > 0:
+        sigma = np.sqrt(rest / spare)
     else:
-        sigma = noise_level(free, what="the part of the log that settings are compared by" if is_rough else "the log")
-    rows = np.concatenate([free.R, free.d[:, None]], axis=1)
-    # The residual of all columns is one more row, so that the eliminated triangle keeps the loss and not only its minimiser.
-    rows = np.concatenate([rows, np.append(np.zeros(free.R.shape[1]), np.sqrt(free.rest))[None]])
+        what = "the part of the log that settings are compared by" if is_rough else "the log"
+        sigma = noise_level(free, count, what=what)
     units = data.units.reshape(-1)[places - data.basic]
     # Rows are in N m here: the prior's rows, sqrt(prior) c / unit in deviations, are multiplied by sigma.
-    R, coefficients = eliminate(rows, len(places), np.sqrt(setting.prior) * sigma / units)
-    condensed = pad_triangle(R, count)
+    R, coefficients = eliminate(free, len(places), np.sqrt(setting.prior) * sigma / units)
     # Noise-free logs stay well posed by a small share of the torque.
     sigma = max(float(sigma), _FINEST * float(np.sqrt(np.mean(sizes[0] ** 2))))
-    problem = TorqueProblem.of(chart, condensed, sigma, setting.prior)
+    problem = TorqueProblem.of(chart, R, sigma, setting.prior)
     end = problem.minimize(_ROUGH if is_rough else _FINE, callback)
     origin, terms = end.last.point
     # Interior points never reach a bound. Exact zeros let `intervals` recognise the terms that are held there.
@@ -196,7 +196,7 @@ def eliminate(rows: np.ndarray, count: int, ridge: np.ndarray) -> tuple[np.ndarr
     **Returns:** the rows [R, d] of the squared error that is left, |R x - d|^2, and the function from x to c.
     """
     prior = np.concatenate([np.diag(ridge), np.zeros((count, rows.shape[1] - count))], axis=1)
-    R = np.asarray(np.linalg.qr(np.concatenate([rows, prior]), mode="r"))
+    R = triangle_of(np.concatenate([rows, prior]))
 
     def coefficients(x: np.ndarray) -> np.ndarray:
         rest = R[:count, -1] - R[:count, count:-1] @ x

@@ -11,10 +11,11 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Block, Inertias, Numbers, Tied
-from jaxdyn.identify.chart import FROM_PSEUDO, LOG_CHOLESKY_BASIS, LOG_CHOLESKY_PLACES, make_chart
+from jaxdyn.identify.chart import FROM_PSEUDO, LOG_CHOLESKY_BASIS, LOG_CHOLESKY_PLACES, make_chart, pseudo_factor
 from jaxdyn.identify.descent import Descent, Iterate, Method, Watch, descend
-from jaxdyn.identify.regression import Condensed, free_columns, nominal_parameters
+from jaxdyn.identify.regression import free_columns, nominal_parameters
 from jaxdyn.identify.torque_terms import POSITIVE
+from jaxdyn.model import host_math
 from jaxdyn.model.tree import Model
 
 _EPS = float(np.finfo(np.float64).eps)
@@ -23,7 +24,7 @@ _STEPS = 200
 
 
 class TorqueProblem(NamedTuple):
-    """Convex problem 1/2 (|R x - d|^2 + rest) + prior D(x) in float64, squares over the variance, in a chart's coordinates.
+    """Convex problem 1/2 |R x - d|^2 + prior D(x) in float64, squares over the variance, in a chart's coordinates.
 
     All fits by torques that are linear in the numbers pose it: of robots, of payloads, and of parameters.
     """
@@ -31,12 +32,14 @@ class TorqueProblem(NamedTuple):
     chart: "LinearChart"
     R: np.ndarray
     d: np.ndarray
-    rest: float
     prior: float
 
     @classmethod
-    def of(cls, chart: "LinearChart", condensed: Condensed, sigma: float, prior: float) -> "TorqueProblem":
-        """Problem of condensed logs with the torque noise sigma (N m). **Raises:** ValueError for zero or infinite noise."""
+    def of(cls, chart: "LinearChart", rows: np.ndarray, sigma: float, prior: float) -> "TorqueProblem":
+        """Problem of rows [W, w] of condensed logs with the torque noise sigma (N m).
+
+        **Raises:** ValueError for zero or infinite noise.
+        """
         # An infinite deviation would weigh all errors by zero, and any point would be a minimum.
         if not sigma < np.inf:
             raise ValueError(
@@ -46,7 +49,7 @@ class TorqueProblem(NamedTuple):
             raise ValueError(
                 "the torques of the logs are all zero; a fit by torques needs logs of a robot that is driven"
             )
-        return cls(chart, condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, prior)
+        return cls(chart, rows[:, :-1] / sigma, rows[:, -1] / sigma, prior)
 
     def minimize(self, tolerance: float, callback: Callable | None = None) -> Descent:
         """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
@@ -58,7 +61,7 @@ class TorqueProblem(NamedTuple):
         # The origins are triangular: log det is a sum of logarithms, where a determinant could underflow.
         diagonal = np.diagonal(origin, axis1=1, axis2=2)
         divergence = np.sum(origin**2) - 2 * np.sum(np.log(diagonal)) - 4.0 * len(origin)
-        return float(0.5 * (residual @ residual + self.rest) + self.prior * divergence)
+        return float(0.5 * residual @ residual + self.prior * divergence)
 
 
 class _State(NamedTuple):
@@ -162,6 +165,13 @@ def robot_chart(model: Model, terms: tuple[str, ...], inertia: str, sizes) -> Li
     start = np.where(positive, np.where(own > 0, own / scale, 0.1), 0.0)
     factors = np.asarray(chart.factors, np.float64)
     return LinearChart(given, factors, FROM_PSEUDO, places, chart.count, term_places, scale, positive, start)
+
+
+def body_chart(numbers: np.ndarray) -> LinearChart:
+    """Chart of the ten numbers of one body, with no terms, around nominal ones (10,)."""
+    factors, none = pseudo_factor(host_math.pseudo_inertia(numbers), "full")[None], np.zeros(0)
+    places = np.arange(10)[None]
+    return LinearChart(np.zeros(10), factors, FROM_PSEUDO, places, 10, none.astype(int), none, none.astype(bool), none)
 
 
 def block_chart(blocks: Sequence[Block]) -> LinearChart | None:

@@ -1,30 +1,41 @@
-"""Linear least squares on the torques, with jackknife standard deviations, and identifiability: rank and weak directions."""
+"""Linear least squares on torques with jackknife standard deviations, identifiability, and fits of mechanisms with loops."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify.descent import on_one_thread
-from jaxdyn.identify.logs import Log, as_logs, check_log
+from jaxdyn.identify.logs import Log, as_logs, check_log, signal_sizes
+from jaxdyn.identify.mechanisms import check_motors, motor_regressor
+from jaxdyn.identify.options import Objective
+from jaxdyn.identify.parameter_tree import Parameters
+from jaxdyn.identify.parameters import fit_parameters
 from jaxdyn.identify.regression import (
     BaseParameters,
+    Blocks,
+    SvdSolution,
     base_parameters,
     check_weights,
-    condense,
     condense_model,
-    condense_rows,
     free_columns,
+    group_columns,
     least_squares_by_svd,
     model_torques,
     nominal_parameters,
+    parameter_names,
     torque_error,
+    triangle_of,
 )
-from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms
+from jaxdyn.identify.result import Fit, torques_along
+from jaxdyn.identify.torque_terms import LEAVES, TERMS, Friction, Terms, check_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
 
 
 class LeastSquares(eqx.Module):
@@ -123,30 +134,24 @@ def least_squares(
     base = base_parameters(model, terms, v_s=v_s)
     weights = check_weights(weights, model.nv)
     parts = condense_model(model, logs, v_s=v_s, blocks=blocks)
-    condensed = condense_rows(parts.rows(weights), parts.count())
-    if condensed.rows <= len(base):
+    rows, count = triangle_of(parts.rows(weights)), parts.count()
+    if count <= len(base):
         samples = sum(map(len, logs))
         raise ValueError(f"the log has {samples} samples of {model.nv} torques, too few for {len(base)} combinations")
     x0 = nominal_parameters(model)
     columns = free_columns(model.nb, model.nv, terms)
-    # Terms that are not fitted keep the model's value and move to the right-hand side.
-    residual = condensed.d - condensed.R @ x0
-    fit = least_squares_by_svd(condensed.R[:, columns[base.independent]], residual, rcond)
-    rest = condensed.rest + fit.rest
-    # Directions that stay at the model's values use up no degree of freedom.
-    sigma = float(np.sqrt(rest / (condensed.rows - fit.rank)))
-    covariance = sigma**2 * fit.half @ fit.half.T
     places = columns[base.independent]
+    # Terms that are not fitted keep the model's value and move to the right-hand side.
+    fit = least_squares_by_svd(rows[:, places], rows[:, -1] - rows[:, :-1] @ x0, rcond)
+    # Directions that stay at the model's values use up no degree of freedom.
+    sigma = float(np.sqrt(fit.rest / (count - fit.rank)))
+    covariance = sigma**2 * fit.half @ fit.half.T
     fitted = x0.copy()
     fitted[places] += fit.change
     size = effective_sample_size(
         [model_torques(model, log, fitted, v_s) - np.asarray(log.tau, np.float64) for log in logs]
     )
-    # In coordinates y with x[places] = half y, in which the Hessian of all samples is the identity.
-    gradients = parts.scores(fitted, weights)[:, places] @ fit.half
-    grams = parts.grams(weights)[:, places][:, :, places]
-    grams = np.einsum("pi,bpq,qj->bij", fit.half, grams, fit.half, optimize=True)
-    std, factor = scatter(grams, gradients, fit.half, size)
+    std, factor = scatter(parts, weights, fitted, places, fit.half, size)
     std = np.where(fit.unknown, np.inf, std)
     nominal = base.values(x0[columns])
     parameters = x0.copy()
@@ -169,12 +174,17 @@ def least_squares(
     )
 
 
-def scatter(grams, gradients, half: np.ndarray, size: float) -> tuple[np.ndarray, float]:
-    """Jackknife standard deviations of numbers half y, and the factor of a 95 % interval.
+def scatter(
+    blocks: Blocks, weights: np.ndarray, x: np.ndarray, places: np.ndarray, half: np.ndarray, size: float
+) -> tuple[np.ndarray, float]:
+    """Jackknife standard deviations of the numbers x[places] of least squares, and the factor of a 95 % interval.
 
-    `grams` (blocks, n, n) and `gradients` (blocks, n) of blocks of samples by y; `size`: effective sample size of the errors.
+    `half`: root of their covariance for noise of size 1; `size`: effective sample size of the errors.
     """
-    # There is no prior here: in these coordinates the blocks' curvatures add up to the identity.
+    # In coordinates y with x[places] = half y, in which the Hessian of all samples is the identity: there is no prior here.
+    gradients = blocks.scores(x, weights)[:, places] @ half
+    grams = blocks.grams(weights)[:, places][:, :, places]
+    grams = np.einsum("pi,bpq,qj->bij", half, grams, half, optimize=True)
     estimate = jackknife(grams, gradients, np.zeros((half.shape[1],) * 2), size)
     return np.sqrt(np.sum((half @ estimate.root) ** 2, axis=1)), estimate.factor
 
@@ -247,30 +257,22 @@ def identifiability(
     base = base_parameters(model, terms, v_s=v_s)
     # These columns are independent on a general motion, so that any loss of rank is due to the logs.
     columns = free_columns(model.nb, model.nv, base_terms(terms))[base.independent]
-    A = condense(model, logs, v_s=v_s).R[:, columns]
-    scale = np.linalg.norm(A, axis=0)
-    # Columns that the logs do not excite become zero; scaled to unit length, their rounding errors would count as excited.
-    scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf
-    _, s, Vt = np.linalg.svd(A / scale, full_matrices=False)
-    rank = int(np.sum(s > rcond * s.max(initial=0.0)))
-    # A parameter with any share in the null space is not determined, whatever its other components.
-    unknown = np.sum(Vt[rank:] ** 2, axis=0) > 1e-12
-    weakest = _weakest(s, Vt, rank, base.names, count)
-    silent = tuple(name for name, is_unknown in zip(base.names, unknown, strict=True) if is_unknown)
-    condition = float(s[0] / s[rank - 1]) if rank else np.inf
-    return Identifiability(base, rank, condition, weakest, silent, base.unidentifiable)
+    A = condense_model(model, logs, v_s=v_s).rows(np.ones(model.nv))[:, columns]
+    found = least_squares_by_svd(A, np.zeros(len(A)), rcond)
+    silent = tuple(name for name, is_unknown in zip(base.names, found.unknown, strict=True) if is_unknown)
+    weakest = weakest_directions(found, base.names, count)
+    return Identifiability(base, found.rank, found.condition, weakest, silent, base.unidentifiable)
 
 
-def weakest_directions(A: np.ndarray, names: Sequence[str], count: int = 3) -> list[Direction]:
-    """The least identifiable directions of a regressor (rows, p) of full rank, the weakest first."""
-    _, s, Vt = np.linalg.svd(np.linalg.qr(A / np.linalg.norm(A, axis=0))[1])
-    return _weakest(s, Vt, len(s), names, count)
-
-
-def _weakest(s: np.ndarray, Vt: np.ndarray, rank: int, names: Sequence[str], count: int) -> list[Direction]:
+def weakest_directions(solution: SvdSolution, names: Sequence[str], count: int = 3) -> list[Direction]:
+    """The least identifiable directions of a regressor, the weakest first."""
+    s = solution.singular
     # Singular values descend: the last ones are the weakest directions.
     order = range(len(s) - 1, max(len(s) - 1 - count, -1), -1)
-    return [Direction(float(s[i] / s[0]) if i < rank else 0.0, _words(Vt[i], names)) for i in order]
+    strengths = [float(s[i] / s[0]) if i < solution.rank else 0.0 for i in order]
+    return [
+        Direction(strength, _words(solution.directions[i], names)) for strength, i in zip(strengths, order, strict=True)
+    ]
 
 
 def base_terms(terms) -> tuple[str, ...]:
@@ -284,3 +286,123 @@ def _words(direction: np.ndarray, names: Sequence[str]) -> str:
     signs = np.sign(direction[order[0]]) if order else 1.0
     parts = [f"{signs * direction[i]:+.2f} {names[i]}" for i in order]
     return " ".join(parts).removeprefix("+") + (" ..." if np.sum(direction[order] ** 2) < 0.9 else "")
+
+
+_BLOCKS = 20
+
+
+class MechanismFit(NamedTuple):
+    """Result of `fit_mechanism`.
+
+    - `fit`: the feasible bodies and the motors' friction, `fit.torques(log)` their torques.
+    - `base`: combinations of the parameters that the logs determine; `nominal`, `values`, `std` (nbase,): of the scene given,
+      fitted, and the jackknife standard deviation; `factor`: a 95 % interval is plus and minus this many, for each by itself.
+    - `condition`: of the regressor in these combinations, columns of unit length; `weakest`: the least identifiable directions.
+    """
+
+    fit: Fit
+    base: BaseParameters
+    nominal: np.ndarray
+    values: np.ndarray
+    std: np.ndarray
+    factor: float
+    condition: float
+    weakest: list[Direction]
+
+
+@on_one_thread
+def fit_mechanism(
+    scene: Scene,
+    log: Log | Sequence[Log],
+    motors: Sequence[str],
+    terms: Terms = TERMS,
+    *,
+    v_s: float = 0.01,
+    prior: float = 1.0,
+) -> MechanismFit:
+    """Fit the bodies of a mechanism with loops, and the friction and rotors of its motors, by the torques of these alone.
+
+    Joints without a motor have no friction but that of the file. The feasible fit is that of `fit_parameters` with the error
+    "torque"; the combinations are those of the regressor of the motors' torques along the logs, N^T Y (`motor_basis`).
+
+    **Arguments:** `scene`: the mechanism, with the geometry and the nominal parameters; `log`: one or several, with q, v and a of
+    all joints (`complete_log`); `motors`: names of joints, as many as degrees of freedom; `terms`, `v_s`, `prior` as of
+    `fit_torques`.
+
+    **Raises:** ValueError for another number of motors, and as `fit_parameters`.
+
+    Source: Khalil & Dombre (2002), chapters 9 and 10, base parameters of closed chains.
+    """
+    terms = check_terms(terms, v_s)
+    logs = as_logs(log, scene.system)
+    columns = np.array(check_motors(scene, np.asarray(logs[0].q)[0], motors))
+    start = _with_friction(scene, columns, terms, v_s, signal_sizes(logs))
+    model: Model = start.system
+    every = parameter_names(model, terms)
+    names = every[: 10 * model.nb] + tuple(f"{motor}.{term}" for term in terms for motor in motors)
+    regressors = [motor_regressor(start, one, motors, terms, v_s) for one in logs]
+    W, tau = np.concatenate(regressors), np.concatenate([np.asarray(one.tau)[:, columns] for one in logs])
+    weights = 1 / np.sqrt(np.mean(tau**2, axis=0))
+    base, _ = group_columns((W * weights[:, None]).reshape(-1, len(names)), names, model.nb, np.dtype(model.home.dtype))
+    x0 = _numbers(start, columns, terms)
+    # Springs and the friction of passive joints stay those of the file.
+    places = tuple(columns.tolist())
+    rest = tau - np.concatenate([torques_along(start, one, places)[:, columns] for one in logs])
+    rows, errors = (W[:, :, base.independent] * weights[:, None]), rest * weights
+    flat = rows.reshape(-1, len(base))
+    if len(flat) <= len(base):
+        raise ValueError(f"the logs have {len(flat)} torques of motors for {len(base)} combinations; log more")
+    linear = least_squares_by_svd(flat, errors.reshape(-1), 1e-9)
+    residual = errors - rows @ linear.change
+    # Relative to the torque, as `Objective.noise`; noise-free logs stay well posed.
+    noise = max(float(np.sqrt(linear.rest / (len(flat) - linear.rank))), 1e-6)
+    tree = Parameters(start).inertias(weight=prior)
+    for term in terms:
+        where = LEAVES[term]
+        tree = (tree.free if term == "offset" else tree.positive)(where, rows=columns.tolist())
+    fit = fit_parameters(start, logs, tree, Objective("torque", observed=tuple(motors), noise=2**0.5 * noise))
+    edges = np.cumsum([len(one) for one in logs])[:-1]
+    size = effective_sample_size(np.split(residual, edges))
+    p, tables = len(base), np.array_split(np.concatenate([rows, errors[:, :, None]], axis=2), _BLOCKS)
+    triangles = [[triangle_of(table.reshape(-1, p + 1))] for table in tables]
+    blocks = Blocks(triangles, (np.arange(p),), p, np.array([len(x) for x in tables]), np.zeros(len(tables), int))
+    std, factor = scatter(blocks, np.ones(1), linear.change, np.arange(p), linear.half, size)
+    return MechanismFit(
+        fit,
+        base,
+        base.values(x0),
+        base.values(_numbers(fit.system, columns, terms)),
+        std,
+        factor,
+        linear.condition,
+        weakest_directions(linear, base.names),
+    )
+
+
+def _with_friction(scene: Scene, motors: np.ndarray, terms, v_s: float, sizes) -> Scene:
+    """Scene with one force for the friction of all joints, of which that of the motors is positive, as a fit's start must be."""
+    model, zero = scene.system, np.zeros(scene.nv)
+    torque, velocity, acceleration = sizes
+    # A hundredth of the torque where the file has none: a logarithm needs a start above zero.
+    unit = 0.01 * torque
+    start = {"viscous": model.damping, "coulomb": model.friction, "armature": model.armature}
+    per = {"viscous": velocity, "coulomb": np.ones(scene.nv), "armature": acceleration}
+    for term, own in start.items():
+        own = zero.copy() if own is None else np.array(own, np.float64)
+        if term in terms:
+            least = unit / np.where(per[term] > 0, per[term], 1.0)
+            own[motors] = np.where(own[motors] > 0, own[motors], least[motors])
+        start[term] = own
+    dtype = model.home.dtype
+    viscous, coulomb, armature = (jnp.asarray(start[term], dtype) for term in ("viscous", "coulomb", "armature"))
+    friction = Friction(viscous, coulomb, jnp.asarray(zero, dtype), jnp.asarray(v_s, dtype))
+    others = [force for force in scene.forces if not isinstance(force, (JointDamping, CoulombFriction))]
+    rotors = armature if model.armature is not None or "armature" in terms else None
+    moved = Scene(model.replace(armature=rotors), scene.constraints, [friction, *others])
+    return moved.with_kept_rows(scene.kept_rows)
+
+
+def _numbers(scene: Scene, motors: np.ndarray, terms) -> np.ndarray:
+    """Parameters x (10 nb + terms m,) in the order of the regressor's columns."""
+    friction = [np.asarray(LEAVES[term](scene), np.float64)[motors] for term in terms]
+    return np.concatenate([np.asarray(scene.system.inertias, np.float64).reshape(-1), *friction])

@@ -33,7 +33,7 @@ _OUTLIERS = ("refuse", "drop", "keep")
 
 
 class LogWarning(UserWarning):
-    """Warning of a log that was changed when it was read: angles unwrapped, corrupted samples left out, by joint and count."""
+    """Warning of a log that was changed when it was read, with joints and counts, or that looks wrong in a fit (`fit_robot`)."""
 
 
 class Outlier(NamedTuple):

@@ -43,7 +43,7 @@ from jaxdyn.identify.problem import (
     on_one_device,
     pose_problem,
 )
-from jaxdyn.identify.regression import Blocks, condense_rows
+from jaxdyn.identify.regression import Blocks, triangle_of
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.uncertainty import ErrorRows, standard_deviations, student
 from jaxdyn.model.arguments import Checked, Function
@@ -232,7 +232,7 @@ def minimize_linear_torques(
     rows = np.concatenate([blocks.rows(np.ones(1)), rows])
     prior = weight * problem.prior_weight
     # A deviation for which `TorqueProblem`, with half of the squares, has this loss.
-    end = TorqueProblem.of(chart, condense_rows(rows, count), 0.5**0.5, prior).minimize(_EXCESS * prior)
+    end = TorqueProblem.of(chart, triangle_of(rows), 0.5**0.5, prior).minimize(_EXCESS * prior)
     y, (origin, terms) = np.zeros(unknowns.y.size), end.last.point
     y[places] = log_cholesky_coordinates(origin, chart.count).reshape(-1)
     y[chart.term_places] = np.where(chart.positive, np.log(np.where(chart.positive, terms, 1.0)), terms)

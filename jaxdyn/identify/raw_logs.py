@@ -22,6 +22,7 @@ from jaxdyn.identify.logs import (
 )
 from jaxdyn.identify.regression import log_regressor, nominal_parameters
 from jaxdyn.model.arguments import Checked, Numbers, warn
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
 
 # Bend of a line, as a share of the root mean square, below which it counts as straight, and least number of corners of lines.
@@ -331,8 +332,16 @@ def _motion(frequency: np.ndarray, position: np.ndarray, velocity: np.ndarray) -
 
 # Angles beyond this many turns, and torques this many times off what the nominal bodies need, are worth a question.
 _TURNS, _OFF = 3.0, 20.0
+# So many samples tell the size of a torque.
+_COMPARED = 500
 # Below this share of its own largest velocity a joint has not begun to move; from this share of the error on it is worth a word.
 _REST, _MUCH = 0.01, 0.5
+
+
+def log_warnings(model: Model, log: Log, residual: np.ndarray) -> list[str]:
+    """Warnings about a log of a fit with the errors `residual` (n, nv): contents and starts at rest that look wrong."""
+    labels = columns_of(model).v
+    return [*check_log_content(model, log, labels), *check_rest(log, residual, labels)]
 
 
 def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
@@ -353,8 +362,9 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
             lines.append(
                 f"positions of {names} reach {q[:, far].max():.0f} rad, beyond three turns: are they in degrees?"
             )
-    needed = root_mean_square(log_regressor(model, log) @ nominal_parameters(model))
-    measured = root_mean_square(np.asarray(log.tau, np.float64))
+    some = log[:: max(1, len(log) // _COMPARED)]
+    needed = root_mean_square(log_regressor(model, some) @ nominal_parameters(model))
+    measured = root_mean_square(np.asarray(some.tau, np.float64))
     # Where the bodies need little torque, friction may be most of what is measured, and the ratio says nothing about units.
     compared = (needed > 0.1 * needed.max(initial=0)) & (measured > 0)
     ratio = measured[compared] / needed[compared]

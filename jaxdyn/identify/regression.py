@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.identify.logs import Log, as_logs
+from jaxdyn.identify.logs import Log
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.model.arguments import Number, Numbers, as_array, check_seed, check_shapes, is_concrete
 from jaxdyn.model.configuration import integrate, neutral
@@ -25,34 +25,18 @@ from jaxdyn.model.topology import KINDS
 from jaxdyn.model.tree import Model
 
 
-class Condensed(NamedTuple):
-    """Stacked regressor and torques of a log, W x = w, condensed: |W x - w|^2 = |R x - d|^2 + rest for every x.
-
-    `R` (p, p) upper triangular, `d` (p,), `rest` a number, `rows` the number of rows of W. Taking R instead of the
-    normal matrix W^T W = R^T R keeps the condition number from being squared.
-    """
-
-    R: np.ndarray
-    d: np.ndarray
-    rest: float
-    rows: int
-
-
 @dataclasses.dataclass(frozen=True)
 class Blocks:
     """Regressor and torques of logs, condensed for each block of samples and each torque.
 
-    - `triangles`: for each block a list of nv upper-trapezoidal matrices (m, s + k + 1): columns shared by all torques, the
-      torque's own k terms, and the torque measured (N m).
-    - `shared`: number s of columns that all torques share. `terms`: number k of terms of each torque.
+    - `triangles`: for each block a list of nv upper-trapezoidal matrices (m, k + 1): the columns of that torque, and the torque
+      measured (N m). `columns`: for each torque the indices (k,) of its columns in the parameters x (size,).
     - `samples` (blocks,): samples in each block. `logs` (blocks,): which log each block comes from.
-
-    Parameters x (s + k nv,) are those shared, then one number for each torque of the first term, of the second, ...
     """
 
     triangles: list[list[np.ndarray]]
-    shared: int
-    terms: int
+    columns: tuple[np.ndarray, ...]
+    size: int
     samples: np.ndarray
     logs: np.ndarray
 
@@ -62,24 +46,13 @@ class Blocks:
     @property
     def nv(self) -> int:
         """Number of torques."""
-        return len(self.triangles[0])
-
-    @property
-    def size(self) -> int:
-        """Number of parameters, s + k nv."""
-        return self.shared + self.terms * self.nv
-
-    def places(self, joint: int) -> np.ndarray:
-        """Indices in x of the columns of one torque."""
-        return np.concatenate([np.arange(self.shared), self.shared + joint + self.nv * np.arange(self.terms)])
+        return len(self.columns)
 
     def merge(self, chosen=None) -> list[np.ndarray]:
         """One triangle for each torque, of some blocks (an array of bool or of indices; None: all)."""
         chosen_blocks = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
         return [
-            np.asarray(
-                np.linalg.qr(np.concatenate([self.triangles[block][joint] for block in chosen_blocks]), mode="r")
-            )
+            triangle_of(np.concatenate([self.triangles[block][joint] for block in chosen_blocks]))
             for joint in range(self.nv)
         ]
 
@@ -87,7 +60,7 @@ class Blocks:
         """Sums of squared errors (blocks, nv) of the parameters x on some blocks."""
         chosen_blocks = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
         # The triangle's last column is the torque: R [x, -1] has the length of the error W x - w.
-        columns = [np.append(x[self.places(joint)], -1.0) for joint in range(self.nv)]
+        columns = [np.append(x[places], -1.0) for places in self.columns]
         return np.array(
             [[np.sum((R @ c) ** 2) for R, c in zip(self.triangles[i], columns, strict=True)] for i in chosen_blocks]
         )
@@ -96,27 +69,25 @@ class Blocks:
         """Half the gradients (blocks, p) of each block's weighted squared error at x."""
         result = np.zeros((len(self), self.size))
         for row, triangles in zip(result, self.triangles, strict=True):
-            for joint, R in enumerate(triangles):
-                error = R @ np.append(x[self.places(joint)], -1.0)
-                row[self.places(joint)] += weights[joint] ** 2 * (R[:, :-1].T @ error)
+            for places, weight, R in zip(self.columns, weights, triangles, strict=True):
+                row[places] += weight**2 * (R[:, :-1].T @ (R @ np.append(x[places], -1.0)))
         return result
 
     def grams(self, weights: np.ndarray) -> np.ndarray:
         """W^T W of each block (blocks, p, p), rows weighted."""
         result = np.zeros((len(self), self.size, self.size))
         for matrix, triangles in zip(result, self.triangles, strict=True):
-            for joint, R in enumerate(triangles):
-                places = self.places(joint)
-                # Torques share the inertial columns, so that their Gram matrices overlap and add up there.
-                matrix[np.ix_(places, places)] += weights[joint] ** 2 * (R[:, :-1].T @ R[:, :-1])
+            # Torques share the inertial columns, so that their Gram matrices overlap and add up there.
+            for places, weight, R in zip(self.columns, weights, triangles, strict=True):
+                matrix[np.ix_(places, places)] += weight**2 * (R[:, :-1].T @ R[:, :-1])
         return result
 
     def rows(self, weights: np.ndarray, chosen=None) -> np.ndarray:
         """Rows [W, w] (m, p + 1) with the squares and products of some blocks, each torque's times its weight."""
         parts = []
-        for joint, R in enumerate(self.merge(chosen)):
+        for places, weight, R in zip(self.columns, weights, self.merge(chosen), strict=True):
             part = np.zeros((len(R), self.size + 1))
-            part[:, np.append(self.places(joint), self.size)] = weights[joint] * R
+            part[:, np.append(places, self.size)] = weight * R
             parts.append(part)
         return np.concatenate(parts)
 
@@ -126,18 +97,13 @@ class Blocks:
         return int(samples.sum()) * self.nv
 
 
-def condense_rows(rows: np.ndarray, count: int) -> Condensed:
-    """`Condensed` of rows [W, w] (m, p + 1) that stand for `count` torques."""
-    return pad_triangle(np.asarray(np.linalg.qr(rows, mode="r")), count)
+def triangle_of(rows: np.ndarray) -> np.ndarray:
+    """Upper-trapezoidal matrix with the squares and products of rows.
 
-
-def pad_triangle(triangle: np.ndarray, count: int) -> Condensed:
-    """`Condensed` of rows [W, w] that are a triangle (m, p + 1) already, as of `numpy.linalg.qr`."""
-    p = triangle.shape[1] - 1
-    # QR of fewer rows than columns gives a trapezoid; rows of zeros change no square.
-    triangle = np.concatenate([triangle, np.zeros((max(p + 1 - len(triangle), 0), p + 1))])
-    # The last diagonal entry is the length of the error that no x removes.
-    return Condensed(triangle[:p, :p], triangle[:p, p], float(triangle[p, p] ** 2), count)
+    Of rows [W, w] of a regressor and torques it has the same |W x - w| for every x. Unlike the normal matrix W^T W it keeps the
+    condition number from being squared.
+    """
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def block_slices(lengths: Sequence[int], total: int) -> list[tuple[int, slice]]:
@@ -239,13 +205,6 @@ def _regressor_block(model, q, v, a, v_s):
     return jax.vmap(one)(q, v, a)
 
 
-def condense(model: Model, log: Log | Sequence[Log], *, v_s=0.01, weights=None) -> Condensed:
-    """Stack the regressor (all terms) over one log or several and condense it by QR: memory does not grow with the logs."""
-    weights = check_weights(weights, model.nv)
-    blocks = condense_model(model, as_logs(log), v_s=v_s)
-    return condense_rows(blocks.rows(weights), blocks.count())
-
-
 def condense_model(
     model: Model,
     logs: Sequence[Log],
@@ -253,19 +212,31 @@ def condense_model(
     v_s=0.01,
     coulomb: Sequence[np.ndarray] | None = None,
     extra: Sequence[np.ndarray] = (),
+    carried: Sequence[np.ndarray] = (),
     blocks: int = 1,
     weights: Sequence[np.ndarray] | None = None,
 ) -> Blocks:
     """Condense logs, block by block, by the regressor with all terms.
 
+    The parameters are those of `parameter_names`, then one number for each torque of the first extra term, of the second, ...,
+    then those carried.
+
     **Arguments:** for each log, `coulomb`: columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms
-    (n, nv, k); `weights`: those of its torques (n, nv), ones by default. `blocks`: their approximate number, over all logs.
+    (n, nv, k); `carried`: more columns (n, nv, k) whose numbers all torques share; `weights`: those of its torques (n, nv), ones
+    by default. `blocks`: their approximate number, over all logs.
     """
     shared, joints = 10 * model.nb, np.arange(model.nv)
     of_coulomb = shared + model.nv * TERMS.index("coulomb") + joints
+    terms = len(TERMS) + (extra[0].shape[2] if len(extra) else 0)
+    edge = shared + model.nv * terms
+    size = edge + (carried[0].shape[2] if len(carried) else 0)
+    places = tuple(
+        np.concatenate([np.arange(shared), shared + j + model.nv * np.arange(terms), np.arange(edge, size)])
+        for j in joints
+    )
     triangles, samples, owners = [], [], []
     for which, part in block_slices([len(log) for log in logs], blocks):
-        triangle_of_row = [np.zeros((0, 0))] * model.nv
+        triangle_of_row = [np.zeros((0, len(own) + 1)) for own in places]
         for start in range(part.start, part.stop, _SAMPLES):
             piece = slice(start, min(start + _SAMPLES, part.stop))
             log = logs[which][piece]
@@ -274,19 +245,18 @@ def condense_model(
                 W[:, joints, of_coulomb] = coulomb[which][piece]
             # Each term is a diagonal block: a torque keeps its own column, the others are zero.
             own = W[:, :, shared:].reshape(len(log), model.nv, -1, model.nv)
-            more = np.zeros((len(log), model.nv, 0)) if not len(extra) else extra[which][piece]
+            more = [columns[which][piece] for columns in (extra, carried) if len(columns)]
             for j in joints:
-                table = np.concatenate([W[:, j, :shared], own[:, j, :, j], more[:, j], tau[:, j, None]], axis=1)
                 # The torque is the last column, so that it is weighted with its row.
+                parts = [W[:, j, :shared], own[:, j, :, j], *(x[:, j] for x in more), tau[:, j, None]]
+                table = np.concatenate(parts, axis=1)
                 table = table if weights is None else table * weights[which][piece, j, None]
-                before = triangle_of_row[j] if triangle_of_row[j].size else np.zeros((0, table.shape[1]))
                 # Sequential QR: the triangle so far joins the next rows, so that memory does not grow with the log.
-                triangle_of_row[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
+                triangle_of_row[j] = triangle_of(np.concatenate([triangle_of_row[j], table]))
         triangles.append(triangle_of_row)
         samples.append(part.stop - part.start)
         owners.append(which)
-    terms = triangles[0][0].shape[1] - 1 - shared
-    return Blocks(triangles, shared, terms, np.array(samples), np.array(owners))
+    return Blocks(triangles, places, size, np.array(samples), np.array(owners))
 
 
 class BaseParameters(eqx.Module):
@@ -409,33 +379,40 @@ def group_columns(W: np.ndarray, names: tuple[str, ...], nb: int, dtype: np.dtyp
     return BaseParameters(matrix, independent, names), rank
 
 
-def noise_level(condensed: Condensed, *, what: str = "the log", rcond: float = 1e-9) -> float:
-    """Root mean square residual of the unconstrained least squares, the torque noise of a condensed log; `what`, for the message.
+def noise_level(triangle: np.ndarray, count: int, *, what: str = "the log", rcond: float = 1e-9) -> float:
+    """Root mean square residual of the unconstrained least squares of `count` torques, their noise; `what`, for the message.
 
-    **Raises:** ValueError when the log has no more rows than the regressor's rank: then the noise is not identifiable.
+    **Raises:** ValueError where the torques are no more than the regressor's rank: then the noise is not identifiable.
     """
-    fit = least_squares_by_svd(condensed.R, condensed.d, rcond)
-    if condensed.rows <= fit.rank:
+    fit = least_squares_by_svd(triangle[:, :-1], triangle[:, -1], rcond)
+    if count <= fit.rank:
         # Not the number of unknowns: a log of few rows determines as many combinations of them as it has rows.
         raise ValueError(
-            f"{what} has {condensed.rows} torques, which determine {fit.rank} combinations of parameters and leave no error to "
+            f"{what} has {count} torques, which determine {fit.rank} combinations of parameters and leave no error to "
             "estimate noise by; log more samples"
         )
-    return float(np.sqrt((condensed.rest + fit.rest) / (condensed.rows - fit.rank)))
+    return float(np.sqrt(fit.rest / (count - fit.rank)))
 
 
 class SvdSolution(NamedTuple):
     """Solution of min |A change - b| with columns scaled to unit length and directions below rcond left at zero.
 
-    `half` half^T is the covariance of `change` for noise of size 1 in b; `unknown` marks entries that the rows do not determine.
+    `rest`: the squared error. `half` half^T is the covariance of `change` for noise of size 1 in b; `unknown` marks entries that
+    the rows do not determine. `singular` values and `directions`, in rows, of the scaled columns; the first `rank` count.
     """
 
     change: np.ndarray
     rest: float
     half: np.ndarray
     unknown: np.ndarray
-    condition: float
+    singular: np.ndarray
+    directions: np.ndarray
     rank: int
+
+    @property
+    def condition(self) -> float:
+        """Ratio of the largest singular value to the least that counts."""
+        return float(self.singular[0] / self.singular[self.rank - 1]) if self.rank else np.inf
 
 
 def least_squares_by_svd(A: np.ndarray, b: np.ndarray, rcond: float) -> SvdSolution:
@@ -449,8 +426,7 @@ def least_squares_by_svd(A: np.ndarray, b: np.ndarray, rcond: float) -> SvdSolut
     half = (Vt[:rank].T / s[:rank]) / scale[:, None]
     # Any component in a direction that is not excited leaves a parameter undetermined.
     unknown = np.sum(Vt[rank:] ** 2, axis=0) > 1e-12
-    condition = float(s[0] / s[rank - 1]) if rank else np.inf
-    return SvdSolution(change, float(np.sum((b - A @ change) ** 2)), half, unknown, condition, rank)
+    return SvdSolution(change, float(np.sum((b - A @ change) ** 2)), half, unknown, s, Vt, rank)
 
 
 def torque_error(predicted: Numbers, measured: Numbers) -> float:

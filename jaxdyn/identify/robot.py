@@ -16,14 +16,15 @@ import numpy as np
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed_fit import Estimate, Intervals, Setting
 from jaxdyn.identify.descent import on_one_thread
+from jaxdyn.identify.log_repair import LogWarning
 from jaxdyn.identify.logs import Log, as_logs
-from jaxdyn.identify.raw_logs import differentiate
+from jaxdyn.identify.raw_logs import differentiate, log_warnings
 from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_logs import RobotLogs, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, improving_torques, search, splits
 from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, TorqueTerm, candidates, check_terms, split_terms
-from jaxdyn.model.arguments import Checked, Numbers, deprecated
+from jaxdyn.model.arguments import Checked, Numbers, deprecated, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.tasks import DaskClient, open_engine
 
@@ -255,6 +256,9 @@ def fit_robot(
     **Raises:** ValueError when logs and model do not fit together, for unknown terms, nominal bodies that are not feasible, and
     arguments out of range.
 
+    **Warns:** `LogWarning` for logs that look wrong: angles in degrees, torques in other units or in front of the gears, joints
+    that hardly move, and errors that are due to a start at rest.
+
     Source: Rucker & Wensing (2022), log-Cholesky coordinates; Lee, Wensing & Park (2020), "Geometric robot dynamic
     identification: a convex programming approach", divergence and convexity; Stone (1974), cross-validation; Holland & Welsch
     (1977), iteratively reweighted least squares.
@@ -297,6 +301,9 @@ def fit_robot(
         problem = RobotLogs(model, logs, basic, extra, inertia, blocks)
     estimate = problem.refine(setting, fixed)
     fit = problem.result(setting, estimate)
+    for number, one in enumerate(logs, 1):
+        for line in log_warnings(model, one, fit.torques(one) - np.asarray(one.tau, np.float64)):
+            warn(f"log {number}: {line}", LogWarning)
     if is_found and delays is not None and delays.seconds.any():
         spread, delays = with_delays(problem, setting, estimate, fit, delays)
     else:

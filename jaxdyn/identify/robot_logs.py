@@ -21,9 +21,9 @@ from jaxdyn.identify.condensed_fit import (
 from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
-from jaxdyn.identify.omitted_terms import find_shifts, include_shifts
-from jaxdyn.identify.regression import free_columns, log_regressor, nominal_parameters, parameter_names
+from jaxdyn.identify.regression import free_columns, log_regressor, nominal_parameters, parameter_names, triangle_of
 from jaxdyn.identify.result import Fit
+from jaxdyn.identify.selection import find_shifts, include_shifts
 from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm, candidates
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white, model_error_factors
 from jaxdyn.model.tree import Model
@@ -83,7 +83,7 @@ class RobotLogs:
         rest = np.setdiff1d(np.arange(len(blocks)), part)
         if key not in self._rows:
             # One triangle for each fold, shared by all settings that differ in terms and prior alone.
-            self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
+            self._rows[key] = triangle_of(blocks.rows(self.weights, rest))
         estimate = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
         # All losses are scored by plain squares; weighted ones would favour the loss that ignores most samples.
         return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part)

@@ -20,7 +20,7 @@ from jaxdyn.identify.logs import Log, log_rate
 from jaxdyn.identify.methods import RANK_TOLERANCE
 from jaxdyn.identify.options import BALANCES
 from jaxdyn.identify.problem import Problem, segment_starts
-from jaxdyn.identify.regression import Blocks, block_slices, least_squares_by_svd
+from jaxdyn.identify.regression import Blocks, block_slices, least_squares_by_svd, triangle_of
 
 # Least numbers of blocks and of independent errors in a group, where these leave at least so many groups: squares of Student's t
 # have no variance below five degrees of freedom.
@@ -267,8 +267,9 @@ class ErrorRows(NamedTuple):
         table, block = np.concatenate([rows, -errors[:, None]], axis=1), np.repeat(self.block, self.width)
         edges = np.flatnonzero(np.diff(block, prepend=-1, append=block[-1] + 1))
         tables = [table[a:b] for a, b in itertools.pairwise(edges)]
-        triangles = [[x if len(x) <= x.shape[1] else np.asarray(np.linalg.qr(x, mode="r"))] for x in tables]
-        return Blocks(triangles, rows.shape[1], 0, np.diff(edges), self.log[edges[:-1] // self.width])
+        triangles = [[x if len(x) <= x.shape[1] else triangle_of(x)] for x in tables]
+        p = rows.shape[1]
+        return Blocks(triangles, (np.arange(p),), p, np.diff(edges), self.log[edges[:-1] // self.width])
 
     def groups(self, errors: np.ndarray) -> list[np.ndarray]:
         """Blocks of each jackknife group: consecutive ones of a log, or whole logs where there are many."""
@@ -292,7 +293,7 @@ def standard_deviations(
     Source: Bell & McCaffrey (2002), CR3; Angrist & Pischke (2009), "Mostly harmless econometrics", section 8.2, the maximum.
     """
     ones, count = np.ones(1), blocks.count() - used
-    whole = np.asarray(np.linalg.qr(blocks.rows(ones), mode="r"))
+    whole = triangle_of(blocks.rows(ones))
     data = whole[:, :-1]
     if len(prior) == 0:
         count -= least_squares_by_svd(data, np.zeros(len(data)), RANK_TOLERANCE).rank

@@ -331,7 +331,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(truth, folder, run):
         jd.save_urdf(truth, "x.urdf", torques={"elbow": {"offset": 1.0}})
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_identify_finds_delays(truth, folder, run):
     """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""
     simulate_logs(truth, "AB", noise=0.005, delay=0.02)
@@ -389,7 +389,7 @@ def test_identify_a_payload(truth, run):
     assert "the bodies are" in run(f"{command} --payload-body foot", status=2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_identify_the_gains_of_drives_from_a_known_payload(truth, folder, run):
     """Currents of three drives; what is written is then the robot in newton metres."""
     gains = np.array([0.8, 1.2, 1.1])

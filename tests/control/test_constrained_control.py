@@ -280,6 +280,52 @@ def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
         jd.simulate(scene, q0, v0, TS, control=law)
 
 
+@pytest.fixture(scope="module")
+def pushed_bead():
+    """A bead on the unit circle that one motor pushes along x: none can at the angle 0, where it moves along y."""
+    bead = jd.LagrangianSystem(lambda q, v: 0.65 * jnp.sum(v**2), 2)
+    ring = jd.Scene(bead, [jd.Holonomic(lambda q, t: jnp.sum(q**2)[None] - 1.0, name="ring")])
+    return ring, jd.control.HybridForce(ring, lambda q: q[1:], [-0.5], KP, KD, actuated=[0], least_regularity=0.1)
+
+
+def test_regularity_counts_the_motors(pushed_bead):
+    """|cos| of the angle for the task y, |sin| for a motor along x; of several passive joints by a QR of the whitened motions."""
+    law = pushed_bead[1]
+    regularity = quick(
+        jax.vmap(lambda angle: law.regularity(jnp.stack([jnp.cos(angle), jnp.sin(angle)]), jnp.zeros(2)))
+    )
+    angles = np.array([0.0, 0.2, 0.9, np.pi / 2, 2.0])
+    expected = np.minimum(np.abs(np.sin(angles)), np.abs(np.cos(angles)))
+    np.testing.assert_allclose(regularity(angles), expected, atol=1e-15)
+    dead, v = jnp.array([1.0, 0.0]), jnp.array([0.0, 0.3])
+    assert not bool(law.is_regular(dead, v)) and bool(law.is_regular(jnp.array([0.6, 0.8]), jnp.zeros(2)))
+    assert np.isfinite(law(dead, v)).all()
+
+    scene = scenes.parallel_manipulator()
+    q, v = scenes.parallel_manipulator.start()
+    robot, driven = (
+        jd.control.HybridForce(scene, lambda q: q[:1], jnp.zeros(1), KP, KD, actuated=motors)
+        for motors in (["a1", "b1"], None)
+    )
+    U = np.linalg.cholesky(jd.mass_matrix(scene.system, q)).T
+    Y = np.linalg.solve(U.T, np.asarray(jd.constraint_jacobian(scene, q)).T)
+    fixed, idle = Y @ np.linalg.pinv(Y, rcond=1e-9), U[:, [1, 3, 4, 5]]
+    sines = np.abs(np.diagonal(np.linalg.qr(fixed @ idle)[1])) / np.linalg.norm(idle, axis=0)
+    assert sines.min() < 0.9 * driven.regularity(q, v)
+    np.testing.assert_allclose(robot.regularity(q, v), sines.min(), rtol=1e-10)
+    assert bool(robot.is_regular(q, v))
+
+
+@pytest.mark.long
+def test_a_motion_to_where_motors_do_not_hold_ends_with_a_code(pushed_bead):
+    """The height goes as the gains say until it is 0.1, where the bead moves almost across its motor."""
+    ring, law = pushed_bead
+    solution = jd.simulate(ring, jnp.array([0.8, 0.6]), jnp.zeros(2), TS, control=law, throw=False)
+    assert solution.result == jd.RESULTS.control_singular
+    time = brentq(lambda t: decayed(np.array([t]), np.array([1.1]), np.zeros(1))[0, 0] - 0.6, 0.0, 2.0, xtol=1e-14)
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-7)
+
+
 @pytest.mark.slow
 def test_gains_are_tuned_over_perturbed_systems():
     """The cost of the page on tuning: its gradient in three gains against differences, and a step that lowers it."""
@@ -307,6 +353,10 @@ def test_gains_are_tuned_over_perturbed_systems():
         (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, internal=[1.0]), "internal is given without"),
         (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, actuated=[0, 7]), "actuated is"),
         (lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, actuated=[0], ki=1.0), "omit them"),
+        (
+            lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, actuated=[0]),
+            "1 of 3 velocities.*name a motor",
+        ),
         (
             lambda s: jd.control.HybridForce(s, first_two, circle, 1.0, 1.0, force=jnp.zeros(2))(*_state(s)),
             r"force has shape \(2,\), expected \(1,\)",

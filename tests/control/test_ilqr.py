@@ -122,18 +122,17 @@ def test_boxes_without_a_minimum_have_a_flag():
 def test_limits_with_an_ill_conditioned_cost():
     """One step of controls whose Hessian has a condition number of 1e6: the minimum in the box, by SciPy."""
     rng = np.random.default_rng(3)
+
+    @jax.jit
+    def solve(A, b):
+        loss, still = lambda x, u, k: 0.5 * jnp.sum((A @ u - b) ** 2), lambda x: 0.0 * x[0]
+        return jd.control.ilqr(lambda x, u: x, loss, still, jnp.zeros(1), jnp.zeros((1, 4)), limits=(-1.0, 1.0))
+
     for _ in range(8):
         Q = np.linalg.qr(rng.normal(size=(4, 4)))[0]
         roots = np.sqrt(np.logspace(0, -6, 4))[:, None] * Q.T
         target = rng.normal(size=4) * np.array([1.0, 0.3, 0.1, 0.03])
-        plan = jd.control.ilqr(
-            lambda x, u: x,
-            lambda x, u, k, A=roots, b=target: 0.5 * jnp.sum((jnp.asarray(A) @ u - b) ** 2),
-            lambda x: 0.0 * x[0],
-            jnp.zeros(1),
-            jnp.zeros((1, 4)),
-            limits=(-1.0, 1.0),
-        )
+        plan = solve(roots, target)
         want = lsq_linear(roots, target, (-1.0, 1.0), method="bvls", tol=1e-14)
         assert plan.result == jd.RESULTS.successful
         np.testing.assert_allclose(plan.cost, want.cost, rtol=1e-9)
@@ -218,7 +217,7 @@ def test_arm_reaches_places_in_a_batch():
     assert np.abs(ends - goals).max() < 1e-3 and np.all(batch.cost < 1e-3 * batch.costs[:, 0])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_car_with_rolling_wheels():
     """A differential drive comes to a place beside it, which its wheels cannot roll to directly."""
     scene = scenes.differential_drive()

@@ -147,7 +147,7 @@ def test_weights_that_have_not_settled_are_said(monkeypatch):
     for limits in ({"MOST_ROUNDS": 1}, {"MOST_ROUNDS": 2, "_STEPS": 1}):
         with monkeypatch.context() as patch:
             for name, least in limits.items():
-                patch.setattr(f"jaxdyn.identify.drive_gains.{name}", least)
+                patch.setattr(f"jaxdyn.identify.payloads.{name}", least)
             short = identify.fit_gains(model, unloaded, loaded, MASS, CENTRE, v_s=0.05)
         assert short.result is RESULTS.max_steps_reached
         assert "NOT CONVERGED: max steps reached" in gains_text(short, model.joint_names)

@@ -21,7 +21,7 @@ from jaxdyn.identify.condensed_fit import Setting
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, TorqueProblem, robot_chart
 from jaxdyn.identify.methods import Unknowns
 from jaxdyn.identify.problem import errors_of, pose_problem
-from jaxdyn.identify.regression import condense
+from jaxdyn.identify.regression import condense_model
 from jaxdyn.identify.robot_logs import RobotLogs, scene_with_parameters
 from jaxdyn.io import load_model
 from jaxdyn.model.builder import ModelBuilder
@@ -282,7 +282,7 @@ def stretched(seed):
 def test_torque_loss_is_the_sum_over_samples(wrong_iiwa, iiwa_log):
     """The condensed loss against all samples and the divergence's definition, at random points of the chart."""
     chart = robot_chart(wrong_iiwa, identify.TERMS, "full", UNITS)
-    problem = TorqueProblem.of(chart, condense(wrong_iiwa, iiwa_log), 0.5, 0.7)
+    problem = TorqueProblem.of(chart, condense_model(wrong_iiwa, [iiwa_log]).rows(np.ones(7)), 0.5, 0.7)
     W = identify.regressor(wrong_iiwa, iiwa_log.q, iiwa_log.v, iiwa_log.a)
     for seed in range(3):
         x = chart.x(stretched(seed), chart.start)
@@ -335,7 +335,7 @@ def test_interior_points_end_with_a_code_where_numbers_are_not_finite(iiwa, iiwa
     with np.errstate(all="ignore"), pytest.raises(ValueError, match="squares overflow"):
         identify.fit_torques(iiwa, huge)
     chart = robot_chart(iiwa, identify.TERMS, "full", UNITS)
-    method = InteriorPoint(TorqueProblem.of(chart, condense(iiwa, iiwa_log), 0.5, 0.7), 1e-9)
+    method = InteriorPoint(TorqueProblem.of(chart, condense_model(iiwa, [iiwa_log]).rows(np.ones(7)), 0.5, 0.7), 1e-9)
     iterate = method.init(chart.start, None)
     assert method.step(iterate, [iterate.loss], iterate)[1] is None
     state, targets = iterate.state

@@ -11,7 +11,7 @@ import jaxdyn as jd
 from jaxdyn.cli import main
 from jaxdyn.constraints.base import position_residual
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.identify.applied_fits import fit_mechanism
+from jaxdyn.identify.linear_fit import fit_mechanism
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.result import Segments, simulate_segment
 
@@ -50,7 +50,7 @@ def computed(scene, log, parameters, observed):
     return jd.identify.fit_parameters(scene, log, parameters, objective, jd.identify.Solver(tolerance=1e-8, steps=15))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_energy_tells_the_coupler_of_a_four_bar():
     """Its mass by the balance of energy, which constraints do not enter, from the crank alone."""
     q0, v0 = jd.scenes.four_bar.start()
@@ -265,7 +265,7 @@ def loaded(tmp_path, name, masses):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("name", ["four-bar", pytest.param("five-bar", marks=pytest.mark.slow)])
 def test_base_parameters_of_a_mechanism_from_its_motors(tmp_path, name):
     """Those of the true mechanism, without noise; the truth is forward dynamics with multipliers, which knows no basis."""
     true, wrong, motors = loaded(tmp_path, name, (0.9, 1.5)), loaded(tmp_path, name, (1.1, 1.2)), LOOPS[name][1]
@@ -317,7 +317,7 @@ def test_motors_must_be_as_many_as_degrees_of_freedom(tmp_path):
         )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_command_identifies_a_mechanism_from_a_log_of_its_motor(tmp_path, capsys):
     true, _ = loaded(tmp_path, "four-bar", (0.9, 1.5)), loaded(tmp_path, "four-bar", (1.1, 1.2))
     t = np.linspace(0, 10, 1001)

@@ -315,8 +315,11 @@ def reversed_slope(x):
 reversed_slope.defjvp(lambda primals, tangents: (primals[0], -tangents[0]))
 
 
+METHODS = ["gauss-newton", "levenberg-marquardt", "dogleg", pytest.param("lbfgs", marks=pytest.mark.slow)]
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "dogleg", "lbfgs"])
+@pytest.mark.parametrize("method", METHODS)
 def test_steps_that_lower_no_loss_are_no_solution(method):
     """Every trial fails, until the damping or the line search has made steps too short to be seen."""
     t = np.linspace(0, 3, 20)

@@ -1,5 +1,6 @@
 """Contacts of collision shapes of files with the ground: shapes, friction, choice, and what is left out."""
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -20,6 +21,12 @@ SIZES = {
 COUNTS = {"box": 8, "sphere": 1, "cylinder": 8, "capsule": 2, "mesh": 4, "ellipsoid": 1}
 TETRAHEDRON = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
 OBJ = "".join(f"v {x} {y} {z}\n" for x, y, z in TETRAHEDRON) + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def gaps_of(scene, q):
+    """Gap of each contact of a scene by name."""
+    touching = touching_of(scene)
+    return jax.jit(lambda q: {k: one.contact.position(scene.system, q, 0.0)[0] for k, one in touching.items()})(q)
 
 
 def touching_of(scene):
@@ -51,7 +58,7 @@ def test_urdf_shapes_touch_the_ground(urdf):
     scene = silent(urdf, contacts="ground")
     assert any("collision shapes without contacts: base (fixed)" in line for line in scene.not_taken)
     touching = touching_of(scene)
-    q, c, s = jnp.full(5, 0.2), np.cos(0.3), np.sin(0.3)
+    c, s, distances = np.cos(0.3), np.sin(0.3), gaps_of(scene, jnp.full(5, 0.2))
     least = {
         "box": 0.7 - 0.15 * s - 0.05 * c,
         "sphere": 0.6,
@@ -63,7 +70,7 @@ def test_urdf_shapes_touch_the_ground(urdf):
         own = [one for key, one in touching.items() if key.split()[0] == name]
         assert len(own) == COUNTS[name]
         assert {float(one.coefficient) for one in own} == {0.4 if name == "box" else 1.0}
-        gaps = [float(one.contact.position(scene.system, q, 0.0)[0]) for one in own]
+        gaps = [distances[key] for key in distances if key.split()[0] == name]
         np.testing.assert_allclose(min(gaps), least[name], atol=1e-12)
 
 
@@ -208,11 +215,10 @@ def test_mjcf_geoms_touch_a_plane(tmp_path):
     m.geom_margin[:] = 10.0
     d = mujoco.MjData(m)
     mujoco.mj_forward(m, d)
-    q = scene.starts["reference"].q
     floor, ours = m.geom("floor").id, {}
-    for name, one in touching.items():
+    for name, gap in gaps_of(scene, scene.starts["reference"].q).items():
         key = int(name.split()[1]) if name.startswith("b") else 7
-        ours[key] = min(ours.get(key, np.inf), float(one.contact.position(scene.system, q, 0.0)[0]))
+        ours[key] = min(ours.get(key, np.inf), float(gap))
     theirs = {}
     for contact in d.contact[: d.ncon]:
         if floor in contact.geom:

@@ -158,7 +158,8 @@ def test_wrenches_of_constraints_on_bodies(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "freedom"), [("four_bar", 1), ("chaplygin_sleigh", 2), ("bennett", 1), ("rolling_coin", 3)]
+    ("name", "freedom"),
+    [("four_bar", 1), ("bennett", 1), ("rolling_coin", 3), pytest.param("chaplygin_sleigh", 2, marks=pytest.mark.slow)],
 )
 def test_degrees_of_freedom(name, freedom):
     make = getattr(jd.scenes, name)

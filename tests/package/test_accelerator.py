@@ -134,7 +134,8 @@ def test_kernels_that_run_thread_by_thread_on_a_cpu_run_on_an_accelerator(name):
             np.testing.assert_allclose(x, y, rtol=0, atol=bound * max(1.0, np.abs(y).max(initial=0.0)))
 
 
-SLOW = "four-bar's gradient", "Bennett's linkage", "four-bar"
+SLOW = "four-bar's gradient", "Bennett's linkage", "four-bar", "four-bar in fixed steps", "ball on an incline"
+SLOW = *SLOW, "rolling disk, minimal velocities"
 
 
 @pytest.mark.long

@@ -62,7 +62,10 @@ CASES = [four_bar, platform, delta_robot, redundant, overconstrained, rolling]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=pytest.mark.slow if case is platform else (), id=case.__name__) for case in CASES],
+)
 def test_inverse_of_constrained_dynamics(case):
     """The torques give back the acceleration and the multipliers, which satisfy the equations of motion."""
     scene, q, motors, independent = case()

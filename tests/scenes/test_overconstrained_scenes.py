@@ -243,6 +243,7 @@ def test_rows_that_lose_rank_on_the_way_are_exchanged(tolerance):
     assert int(motion.stats["num_steps"]) < 20 and np.ptp(motion.energy) < 1e3 * tolerance
 
 
+@pytest.mark.slow
 def test_gradients_go_through_a_flat_position():
     """Sarrus' linkage falls through its flat position: the energy at the end changes with the rate as that of the start."""
     scene, (q, v) = jd.scenes.sarrus(), jd.scenes.sarrus.start(rate=-1.0)

@@ -1,5 +1,6 @@
 """Forward mode of runs and steps whose derivatives exist in reverse mode: refused with the option that allows it."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,10 +35,23 @@ def test_forward_mode_names_its_option(function):
     np.testing.assert_allclose(
         jax.jit(jax.jacfwd(lambda q: function(q, adjoint="forward")))(Q), by_rows, rtol=1e-9, atol=1e-12
     )
-    if function is not stiffly:
-        hessian = jax.jit(jax.hessian(lambda q: function(q, adjoint="forward").sum()))(Q)
-        np.testing.assert_allclose(
-            jax.jit(jax.jacfwd(jax.grad(lambda q: function(q).sum())))(Q), hessian, rtol=1e-8, atol=1e-10
-        )
-    batch = jax.jit(jax.vmap(jax.grad(lambda q: function(q).sum())))(jnp.stack([Q, Q]))
-    np.testing.assert_allclose(batch[1], by_rows.sum(0), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.long
+def test_methods_with_first_derivatives_alone_name_what_gives_second_ones():
+    def end(q, **options):
+        options = {"method": "variational", "stepsize": jd.simulation.Steps(0.02, max_steps=8)} | options
+        return jd.simulate(jd.scenes.double_pendulum(), q, jnp.zeros(2), TS, **options).q[-1].sum()
+
+    def implicit(q):
+        return end(q, method="auto", solver=diffrax.Kvaerno3(), stepsize=0.02)
+
+    for derivative in (jax.jacfwd(end), jax.hessian(end), jax.jit(jax.hessian(end)), jax.hessian(implicit)):
+        with pytest.raises(ValueError, match='Hessians need adjoint="direct"'):
+            derivative(Q)
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(lambda q: end(q, adjoint="forward"))))(Q)
+    hessian = jax.jit(jax.hessian(lambda q: end(q, adjoint="direct")))(Q)
+    np.testing.assert_allclose(hessian, twice, rtol=1e-9, atol=1e-12)
+    gradient = jax.jit(jax.grad(end))
+    differences = [(gradient(Q + step) - gradient(Q - step)) / 2e-5 for step in 1e-5 * np.eye(2)]
+    np.testing.assert_allclose(hessian, differences, rtol=0, atol=1e-8)  # of the differences

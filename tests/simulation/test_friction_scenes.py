@@ -238,7 +238,7 @@ def test_ball_bounces_as_newton_says():
     np.testing.assert_allclose(motion.q[-1, 0], speed * last - G * last**2 / 2, atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_cotangents_of_a_run_with_too_many_events_are_nan():
     """Behind the last event that there was room for, and before it; the other ball of the batch keeps its own."""
 

@@ -131,8 +131,14 @@ def end_of(move, **options):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("how", ["Dopri8", pytest.param("Tsit5", marks=pytest.mark.slow), "RK4"])
+@pytest.mark.parametrize(
+    ("how", "name"),
+    [
+        pytest.param(how, name, marks=() if how == "Dopri8" or (how, name) == ("RK4", "limit") else pytest.mark.slow)
+        for how in EXPLICIT
+        for name in CASES
+    ],
+)
 def test_a_motion_ends_at_the_root(name, how):
     """Three trajectories, the rows before the end and none behind it, and the derivative of the time by reverse mode."""
     case = CASES[name]
@@ -146,7 +152,7 @@ def test_a_motion_ends_at_the_root(name, how):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param("cone", marks=pytest.mark.slow), "limit", "controller"])
 def test_a_single_motion_has_both_modes(name):
     case = CASES[name]
     x = jnp.asarray(case.numbers[0])

@@ -1,6 +1,7 @@
 """One step at a time, joint stops and limits of effort."""
 
 import re
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -196,31 +197,37 @@ def test_reverse_mode_takes_a_single_step_once(substeps, forward, monkeypatch):
 
 @pytest.mark.long
 def test_steps_and_derivatives_where_rows_are_dependent():
-    """Samples of a batch whose two rows are the same, which the native loops refuse, beside others; without kernels."""
+    """Samples of a batch whose two rows are the same, which the native loops refuse, next to others: as with one row, or two."""
 
-    def rows(q, t):
-        return jnp.stack([jnp.asarray([1.0, 1.0, 0.0]), jnp.stack([1.0, 1.0, jnp.where(q[2] > 0, 1.0 + q[2], 0.0)])])
+    def one(q, t):
+        return jnp.asarray([[1.0, 1.0, 0.0]])
 
-    scene = jd.Scene(jd.robots.chain(3), (jd.Pfaffian(rows),))
+    def two(q, t):
+        return jnp.stack([one(q, t)[0], jnp.stack([1.0, 1.0, 1.0 + q[2]])])
+
+    def both(q, t):
+        return jnp.where(q[2] > 0, two(q, t), one(q, t))
+
     qs = jnp.asarray([[0.3, -0.2, -0.5], [0.3, -0.2, 0.5], [0.1, 0.4, -0.7], [-0.2, 0.3, 0.2], [0.2, 0.1, -0.3]])
     vs = jnp.asarray([[0.5, -0.5, 0.2], [0.5, -0.5, 0.0], [0.1, -0.1, -0.4], [0.3, -0.3, 0.0], [0.0, 0.0, 0.1]])
 
-    def end(q, v, tau):
+    def end(rows, q, v, tau):
+        scene = jd.Scene(jd.robots.chain(3), (jd.Pfaffian(rows),))
+
         def advance(state, _):
             return jd.stepper(scene, 0.02)(state, tau), None
 
         q, v = jax.lax.scan(advance, (q, v), length=3)[0]
         return jnp.sum(jnp.sin(q)) + jnp.sum(v * jnp.arange(1.0, 4.0))
 
-    def compute():
-        return jax.jit(jax.vmap(jax.value_and_grad(end, (0, 1, 2))))(qs, vs, jnp.ones((5, 3)))
-
-    computed = compute()
-    with jd.compilation("plain"):
-        plain = compute()
-    for mine, theirs in zip(jax.tree.leaves(computed), jax.tree.leaves(plain), strict=True):
+    computed, by_one, by_two = (
+        jax.jit(jax.vmap(jax.value_and_grad(partial(end, rows), (0, 1, 2))))(qs, vs, jnp.ones((5, 3)))
+        for rows in (both, one, two)
+    )
+    for mine, single, double in zip(*map(jax.tree.leaves, (computed, by_one, by_two)), strict=True):
         assert jnp.isfinite(mine).all()
-        np.testing.assert_allclose(mine, theirs, rtol=1e-10, atol=1e-11)
+        want = np.where((qs[:, 2] > 0).reshape(-1, *[1] * (mine.ndim - 1)), double, single)
+        np.testing.assert_allclose(mine, want, rtol=1e-10, atol=1e-11)
 
 
 @pytest.mark.parametrize(

@@ -333,7 +333,7 @@ def test_a_step_that_cannot_be_solved_ends_the_run():
     np.testing.assert_array_equal(np.isnan(solution.q[:, 0]), [False, False, False, True])
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_of_a_step_that_was_not_solved_are_nan():
     """In both modes; those of the other batch element remain, and are those of differences."""
     scene = scenes.pendulum_in_plane()

@@ -24,6 +24,11 @@ from jaxdyn.simulation.solvers.choice import innermost
 from jaxdyn.simulation.solvers.driver import COUNTS, FORWARD, ROOM
 from jaxdyn.simulation.solvers.guards import delay
 
+_FIRST_ORDER = (
+    'this method has first derivatives in reverse mode alone; forward mode (jax.jvp, jax.jacfwd) needs adjoint="forward" of '
+    'jd.simulate, Hessians need adjoint="direct", or adjoint="forward" and jax.jacfwd twice'
+)
+
 
 class DiffraxRun(NamedTuple):
     """Arguments of a run in diffrax's loop, as of `diffrax.diffeqsolve`.
@@ -52,6 +57,8 @@ def run(inputs, given: DiffraxRun):
     **Returns:** rows of the state at ts[1:]; the result, the counts, the time reached and, if the time of an event is located,
     the state there; all that diffrax returned.
     """
+    if isinstance(given.adjoint, diffrax.RecursiveCheckpointAdjoint):
+        inputs = reverse_only(inputs, _FIRST_ORDER, first_order=True)
     y0, args, ts = inputs
     located, end = _is_located(given.event), given.end
     saves = diffrax.SubSaveAt(ts=ts[1:])

@@ -1,4 +1,6 @@
-"""Gains of drives from a known payload.
+"""Fits with logs of a robot without a payload and with one: of the payload, and of the gains of drives by a known payload.
+
+A payload is the difference that it makes: the robot's own parameters are eliminated exactly.
 
 A drive's log holds its current, or a torque under an uncertain gain: i = tau / g. Gains and inertias scale each other, so that
 neither is identifiable from a robot's own logs; a payload of known mass and centre adds a known torque p (N m), and both are:
@@ -15,11 +17,14 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.identify.condensed_fit import MOST_ROUNDS, is_negligible
+from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
+from jaxdyn.identify.chart import check_bodies
+from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, is_negligible
 from jaxdyn.identify.descent import on_one_thread
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, TorqueProblem, body_chart
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import (
     Blocks,
@@ -27,11 +32,17 @@ from jaxdyn.identify.regression import (
     condense_model,
     coordinate_names,
     free_columns,
+    least_squares_by_svd,
     log_regressor,
+    noise_level,
+    triangle_of,
 )
+from jaxdyn.identify.result import Fit
+from jaxdyn.identify.robot import RobotFit, fit_robot
 from jaxdyn.identify.selection import VELOCITIES
-from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, coulomb_through_filter
-from jaxdyn.identify.uncertainty import jackknife
+from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, check_terms, coulomb_through_filter, split_terms
+from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
+from jaxdyn.model import host_math
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.arguments import Numbers, deprecated, warn
 from jaxdyn.model.tree import Model
@@ -130,16 +141,14 @@ def fit_gains(
     number, logs = model.body_names.index(body), (*unloaded, *loaded)
     is_loaded = np.arange(len(logs)) >= len(unloaded)
     own = slice(10 * number, 10 * number + 10)
-    carried = []
-    for log, holds in zip(logs, is_loaded, strict=True):
-        columns = holds * log_regressor(model, log)[:, :, own]
-        # Mass and first moments are known; the six numbers of the rotational inertia stay.
-        free = columns[:, :, 4:] if inertia is None else columns[:, :, :0]
-        carried.append(np.concatenate([(columns @ known)[:, :, None], free], axis=2))
+    held = [holds * log_regressor(model, log)[:, :, own] for log, holds in zip(logs, is_loaded, strict=True)]
+    torque = [(columns @ known)[:, :, None] for columns in held]
+    # Mass and first moments are known; the six numbers of the rotational inertia stay, which all torques share.
+    carried = [columns[:, :, 4:] if inertia is None else columns[:, :, :0] for columns in held]
     best = None
     for velocity in VELOCITIES if isinstance(v_s, str) else (float(v_s),):
         coulomb = [coulomb_through_filter(log, velocity) for log in logs]
-        data = condense_model(model, logs, v_s=velocity, coulomb=coulomb, extra=carried, blocks=blocks)
+        data = condense_model(model, logs, v_s=velocity, coulomb=coulomb, extra=torque, carried=carried, blocks=blocks)
         trial = _fit(_Problem(model, data, terms), velocity)
         if best is None or trial[0] < best[0]:
             best = trial
@@ -160,22 +169,16 @@ class _Problem:
 
     def __init__(self, model: Model, data: Blocks, terms):
         self.data, self.nv = data, model.nv
-        shared = 10 * model.nb
-        base = base_parameters(model, terms)
+        base, known = base_parameters(model, terms), 10 * model.nb + 4 * model.nv
         independent = free_columns(model.nb, model.nv, terms)[base.independent]
-        # Of each torque's terms four are `TERMS` and one is the payload's known torque; the others belong to the unknown inertia.
-        self.size = len(independent) + data.terms - 5
-        # For each joint, the columns of its triangle and the unknowns that these belong to.
-        self.columns, self.unknowns = [], []
-        for joint in range(model.nv):
-            places = data.places(joint)[: shared + 4]
-            where = {int(place): k for k, place in enumerate(places)}
-            pairs = [(where[int(x)], i) for i, x in enumerate(independent) if int(x) in where]
-            pairs += [(shared + 5 + k, len(independent) + k) for k in range(data.terms - 5)]
-            columns, unknowns = np.array(pairs).T
-            self.columns.append(columns)
-            self.unknowns.append(unknowns)
-        self.known = shared + 4
+        every = np.append(independent, np.arange(known + model.nv, data.size))
+        self.size = len(every)
+        # For each joint, the columns of its triangle and the unknowns that these belong to; one is the payload's known torque.
+        number = np.full(data.size, -1)
+        number[every] = np.arange(self.size)
+        self.columns = [np.flatnonzero(number[places] >= 0) for places in data.columns]
+        self.unknowns = [number[places[own]] for places, own in zip(data.columns, self.columns, strict=True)]
+        self.known = 10 * model.nb + 4
 
     def rows(self, joint: int, triangle: np.ndarray, z: np.ndarray, u: float):
         """Errors of a joint's condensed currents at the unknowns z and the gain exp(u), and their Jacobian (m, size + 1)."""
@@ -272,7 +275,7 @@ def _start(problem: _Problem, triangles) -> np.ndarray:
         size = np.linalg.norm(table[:, -2])
         used = np.linalg.norm(table, axis=0) > 0
         used[-2:] = True
-        T = np.asarray(np.linalg.qr(table[:, used], mode="r"))
+        T = triangle_of(table[:, used])
         k = T.shape[1] - 2
         # T[k, k] is the part of the payload's torque that the robot's own parameters do not explain.
         if len(T) > k and abs(T[k, k]) > 1e-6 * size > 0:
@@ -310,3 +313,174 @@ def _minimise(problem: _Problem, triangles, state: _State, start: np.ndarray) ->
     options |= {"ftol": 1e-12, "xtol": 1e-10, "gtol": 1e-14}
     end: Any = least_squares(errors, np.append(z, state.u), **options)
     return state._replace(z=end.x[:size], u=end.x[size:]), bool(end.success)
+
+
+_BLOCKS = 20
+# Weight that holds robot parameters, relative to the size of their columns: enough where no log determines them.
+_HOLD = 1e-7
+# Radius (m) of the ball from which the shape of a payload starts.
+_RADIUS = 0.1
+
+
+class Payload(Outcome):
+    """Result of `fit_payload`.
+
+    - `inertia` (10,): m, m c, I about the origin of the body that holds it, in its frame; physically feasible.
+    - `mass` (kg), `centre` (3,) (m), `rotational` (3, 3) about the centre (kg m^2).
+    - `std` (10,): standard deviations of the ten numbers, by blocks of samples as in `Intervals`; numbers that the logs do not
+      determine have those of the prior. `factor`: a 95 % interval is plus and minus this many of them.
+    - `body`: name of the body that holds it. `robot`: the `RobotFit` of the logs without it.
+    - `error` : torque error of robot and payload along the loaded logs, in per cent; `without`: of the robot alone.
+    - `result`: one of `jd.RESULTS`, `successful` where the robot's fit has converged and so have the loads of the gears, which
+      depend on the payload; else that of the robot's fit, or `max_steps_reached`.
+    """
+
+    inertia: np.ndarray
+    std: np.ndarray
+    factor: float
+    body: str = eqx.field(static=True)
+    robot: RobotFit
+    error: float
+    without: float
+    result: Any
+
+    @property
+    def mass(self) -> float:
+        """Mass (kg)."""
+        return float(self.inertia[0])
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Centre of mass (3,) in the frame of the body that holds it (m)."""
+        return self.inertia[1:4] / self.inertia[0]
+
+    @property
+    def rotational(self) -> np.ndarray:
+        """Rotational inertia (3, 3) about the centre of mass, in axes of that frame (kg m^2)."""
+        return host_math.about_com(self.inertia)[2]
+
+
+@on_one_thread
+def fit_payload(
+    model: Model,
+    unloaded: Log | Sequence[Log],
+    loaded: Log | Sequence[Log],
+    body: str | None = None,
+    terms: RobotTerms = "auto",
+    *,
+    robot: RobotFit | None = None,
+    **options: Any,
+) -> Payload:
+    """Fit the ten inertial numbers of a payload that a robot holds in some logs and not in others.
+
+    The robot's own parameters and its friction are the same in all logs and are eliminated exactly, so that the payload is
+    identified from the difference that it makes. To fit the loaded logs with the last body free, and to subtract, would attribute
+    the robot's errors to the payload.
+
+    **Arguments:**
+
+    - `model`: nominal robot. `unloaded`, `loaded`: logs with v and a, or sequences of them.
+    - `body`: name of the body that holds the payload, the last one by default.
+    - `terms`, `options`: of `fit_robot`, for the logs without payload; `robot`: its result, if there is one already.
+
+    **Returns:** `Payload`. The prior of the payload is a ball of 0.1 m about the centre found by least squares, with weight 1.
+
+    **Raises:** ValueError as `fit_robot`, and for an unknown body.
+
+    Source: Khalil & Dombre (2002), section 12.7; Gaz & De Luca (2017), "Payload estimation based on identified coefficients".
+    """
+    check_bodies(model)
+    unloaded, loaded = as_logs(unloaded, model), as_logs(loaded, model)
+    body = model.body_names[-1] if body is None else body
+    if body not in model.body_names:
+        raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
+    number = model.body_names.index(body)
+    robot = fit_robot(model, unloaded, terms, **options) if robot is None else robot
+    unloaded, loaded = (tuple(robot.align(log) for log in logs) for logs in (unloaded, loaded))
+    setting, x = robot.choice.setting, robot.fit.vector.copy()
+    _, extra, _ = split_terms(robot.terms, model.nv)
+    x[10 * model.nb : -model.nv] = 0  # the bodies and the rotors, whose torque is the gears' load
+    # Columns of the payload: those of its body, zero in logs without it.
+    regressors = [log_regressor(model, log) for log in (*unloaded, *loaded)]
+    bare = [W @ x for W in regressors]
+    is_loaded = np.arange(len(regressors)) >= len(unloaded)
+    own = slice(10 * number, 10 * number + 10)
+    carried = [holds * W[:, :, own] for W, holds in zip(regressors, is_loaded, strict=True)]
+    logs, payload, inertias = (*unloaded, *loaded), np.zeros(10), robot.fit.model.inertias
+
+    def errors(fit: Fit, logs: Sequence[Log]) -> list[np.ndarray]:
+        return [fit.torques(log) - np.asarray(log.tau, np.float64) for log in logs]
+
+    def hold(payload) -> Fit:
+        heavier = inertias.at[number].add(jnp.asarray(payload, inertias.dtype))
+        return eqx.tree_at(lambda fit: fit.system.system.inertias, robot.fit, heavier)
+
+    # Errors without the payload do not depend on it: computed once.
+    residuals = errors(robot.fit, unloaded)
+
+    def size(payload) -> float:
+        return effective_sample_size([*residuals, *errors(hold(payload), loaded)])
+
+    # The load of the gears depends on the payload, which is still zero in the first round.
+    has_loads, result = any(term.needs_load for term in extra), RESULTS.max_steps_reached
+    for _ in range(MOST_ROUNDS):
+        loads = [load + Y @ payload for load, Y in zip(bare, carried, strict=True)]
+        data = gather(model, logs, setting.v_s, extra, loads, _BLOCKS, carried=carried)
+        blocks, kept = data.blocks, np.append(np.arange(data.basic), data.places(setting.extra))
+        rows = blocks.rows(robot.weights)[:, [*kept, *range(blocks.size - 10, blocks.size + 1)]]
+        before = payload
+        sigma = noise_level(rows, blocks.count())
+        payload, std, factor = _solve(blocks, kept, robot.weights, rows, sigma, size)
+        if not has_loads or is_negligible(rows[:, len(kept) : -1], payload - before, sigma):
+            result = robot.fit.result
+            break
+    percent = 100 / np.linalg.norm(np.concatenate([np.asarray(log.tau, np.float64) for log in loaded]))
+    error, without = (
+        float(percent * np.linalg.norm(np.concatenate(errors(fit, loaded)))) for fit in (hold(payload), robot.fit)
+    )
+    return Payload(payload, std, factor, body, robot, error, without, result)
+
+
+def _solve(blocks: Blocks, kept: np.ndarray, weights, rows, sigma: float, size):
+    """Feasible payload, standard deviations (10,) and the factor of an interval.
+
+    `kept`: indices of the robot's parameters; the payload's are the last ten. `rows` [robot, payload, torque], and their noise
+    `sigma`; `size(payload)`: effective sample size of the errors with it.
+    """
+    count = len(kept)
+    hold = _HOLD * np.maximum(np.linalg.norm(rows[:, :count], axis=0), 1e-12)
+    R, robot = eliminate(rows, count, hold)
+    chart = body_chart(_ball(least_squares_by_svd(R[:, :-1], R[:, -1], 1e-6).change))
+    problem = TorqueProblem.of(chart, R, sigma, 1.0)
+    end = problem.minimize(1e-6)
+    if end.result is not RESULTS.successful:
+        raise ValueError(f"the payload's fit ended {name_of(end.result)!r}; do the loaded logs move the robot?")
+    origin, terms = end.last.point
+    payload = chart.x(origin, terms)
+    # In the coordinates of the chart, where the prior's curvature is known; it also determines what no log does.
+    (stretch,) = chart.body_jacobians(origin)
+    basis = LOG_CHOLESKY_BASIS
+    curvature = np.zeros((count + 10, count + 10))
+    # The weak rows that held the robot's parameters in the fit are a prior of theirs here.
+    curvature[np.arange(count), np.arange(count)] = hold**2 / sigma**2
+    curvature[count:, count:] = np.einsum("kij,lji->kl", basis, basis)
+    jacobian, x = np.zeros((blocks.size, count + 10)), np.zeros(blocks.size)
+    jacobian[kept, np.arange(count)], jacobian[-10:, count:] = 1, stretch
+    x[kept], x[-10:] = robot(payload), payload
+    grams = np.einsum("pi,bpq,qj->bij", jacobian, blocks.grams(weights), jacobian, optimize=True) / sigma**2
+    gradients = blocks.scores(x, weights) @ jacobian / sigma**2
+    changes, inverse, factor = jackknife(grams, gradients, curvature, size(payload))
+    # The log-Cholesky basis spans all symmetric matrices, so that its Gram matrix is positive definite.
+    root = np.linalg.cholesky(curvature[count:, count:])
+    from_data, from_prior = stretch @ changes[count:], stretch @ inverse[count:, count:] @ root
+    std = np.sqrt(np.sum(from_data**2, axis=1) + np.sum(from_prior**2, axis=1))
+    return payload, std, factor
+
+
+def _ball(numbers: np.ndarray) -> np.ndarray:
+    """Ball with the mass and the centre of these numbers; a light one at the origin where they are not physical."""
+    mass = float(numbers[0])
+    centre = numbers[1:4] / mass if mass > 0 else np.zeros(3)
+    if not mass > 0 or np.linalg.norm(centre) > 10:
+        mass, centre = max(mass, 0.1), np.zeros(3)
+    return np.asarray(_inertia.displaced(jnp.asarray(_inertia.sphere(mass, _RADIUS)), centre))
