@@ -759,7 +759,8 @@ ROTORS = """<robot name="rotors"><link name="base"/>
   <joint name="j" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/><dynamics damping="0.4"/></joint>
   <joint name="k" type="continuous"><parent link="base"/><child link="b"/><axis xyz="0 0 1"/>
     <mimic joint="j" multiplier="-2"/></joint></robot>"""
-SPRING = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="h" axis="0 0 1" ref="0.3" springref="0.3" stiffness="8"/>
+SPRING = """<mujoco><compiler angle="radian"/><worldbody><body>
+  <joint name="h" axis="0 0 1" ref="0.3" springref="0.3" stiffness="8"/>
   <inertial pos="0 0 0" mass="1" diaginertia="2 2 2"/></body></worldbody></mujoco>"""
 
 
