@@ -81,7 +81,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model_options(parser)
     motion = parser.add_argument_group("motion")
     option(motion, "--duration S", "length of the motion, s (default: 2, or the log's)", real)
-    option(motion, "--sample S", "time between output rows, s (default: 0.01)", real, 0.01)
+    option(
+        motion, "--sample S", "time between output rows, s (default: 0.01), rounded to fill the duration", real, 0.01
+    )
     option(motion, "--start NAME", "a named state of the file (a keyframe)", default="reference")
     option(motion, "--q0 Q ...", "initial q: all of it, or JOINT=VALUE to change some of it (rad, m)")
     option(motion, "--v0 V ...", "initial v, in the same form (default: that of --start; rad/s, m/s)")

@@ -177,7 +177,8 @@ def run(
     **Returns:** a `Run`. A rollout that fails is a row with its code and does not raise.
 
     Results are the same, bit for bit, whether a run was interrupted or not, and for any number of workers and devices and any
-    sizes of batches and chunks on CPUs of one kind; other kinds, and GPUs, round differently in the last bit.
+    sizes of batches and chunks on CPUs of one kind; other kinds, and GPUs, round differently in the last bit. The last bits of
+    means depend on the size of chunks.
 
     **Raises:** ValueError for arguments that do not fit; for a store of another scene, version, seed, ..., with both values; for
     one that another process writes to, with its owner; for a cluster with other versions, or whose workers do not see `out`;
