@@ -2,8 +2,6 @@
 
 LLVM's optimiser and XLA's newer fusion emitters are most of a compile; neither changes what is computed. Options that the
 installed XLA does not have are left out: a compiler option would be refused, and an unknown flag ends the process.
-
-`python tests/xla_options.py` prints the flags of whole test runs.
 """
 
 from jaxdyn.compile.jax_adapter import select_options
@@ -14,7 +12,3 @@ QUICK = select_options({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion
 def flags(**more) -> str:
     """The same as XLA_FLAGS, for processes that a test starts."""
     return " ".join(f"--{name}={str(value).lower()}" for name, value in (QUICK | select_options(more)).items())
-
-
-if __name__ == "__main__":
-    print(flags(xla_cpu_parallel_codegen_split_count=1))
