@@ -50,7 +50,7 @@ USERS = {
     "llvmlite": {"compile"},
     "diffrax": FROM_SIMULATION,
     "optax": {"identify"} | PROGRAMS,
-    "optimistix": {"constraints", "reduction", "simulation"} | PROGRAMS,
+    "optimistix": {"constraints", "reduction", "simulation", "identify"} | PROGRAMS,
     "matplotlib": FILES_AND_PLOTS,
     "scipy": {"contact", "identify"}
     | FILES_AND_PLOTS,  # a dependency of jax, so always there; not when jaxdyn is imported
