@@ -292,9 +292,9 @@ def rollout(name, batch, rounds, steps=100, dt=1e-3):
         return jax.lax.scan(step, (q, v), None, length=steps)[0]
 
     executable, trace, build = compiled(jax.vmap(one), q, v, tau)
-    result = timing.time_alternately({"rk4": lambda: jax.block_until_ready(executable(q, v, tau))}, rounds, least=0.0)[
-        "rk4"
-    ]
+    result = timing.time_alternately(
+        {"rk4": lambda: jax.block_until_ready(executable(q, v, tau))}, rounds, minimum=0.0
+    )["rk4"]
     row = {"robot": name, "batch": batch, "steps": steps, "trace_s": trace, "compile_s": build}
     row |= {
         "steps_per_s": batch * steps / result["best"],

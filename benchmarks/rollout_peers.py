@@ -164,7 +164,7 @@ def main() -> None:
                 f"  {peer}: {time.perf_counter() - before:.2g} s, last positions at most {difference:.1e} from ours",
                 flush=True,
             )
-        times = timing.time_alternately(calls, args.rounds, least=0.0)
+        times = timing.time_alternately(calls, args.rounds, minimum=0.0)
         best = {peer: len(first[peer]) / row["best"] for peer, row in times.items()}
         rows.append(
             [name, batch, *(f"{best[p]:.3g}" if p in best else "-" for p in ("jaxdyn", "C MuJoCo", "MJX", "frax"))]

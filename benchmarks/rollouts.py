@@ -87,7 +87,7 @@ def measure(name: str, batch: int, steps: int, rounds: int) -> dict:
     runs = {
         kind: (lambda call=call, kind=kind: jax.block_until_ready(call(*args[kind]))) for kind, call in calls.items()
     }
-    us = timing.time_alternately(runs, rounds, least=0.0)
+    us = timing.time_alternately(runs, rounds, minimum=0.0)
     for row in us.values():
         for key in ("best", "median"):
             row[key] *= 1e6 / (batch * steps)

@@ -155,7 +155,7 @@ def measure(rungs: list[Rung], batch: int, steps: int, rounds: int) -> list[dict
     """A row per rung, all timed in turn; simulations where there are steps."""
     made = [programs(rung, batch, steps) for rung in rungs]
     calls = {(i, kind): call for i, (_, both) in enumerate(made) for kind, call in both.items()}
-    times = timing.time_alternately(calls, rounds, most=20.0)
+    times = timing.time_alternately(calls, rounds, maximum=20.0)
     rows = []
     for i, (rung, (counted, _)) in enumerate(zip(rungs, made, strict=True)):
         row: dict[str, Any] = {"scene": rung.name, "operations": None if counted is None else counted.all}

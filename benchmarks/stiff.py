@@ -33,7 +33,7 @@ SOLVERS: dict[str, Any] = {
     "RK4, 1 ms": jd.solvers.RK4(),
 }
 FIXED_STEP = 1e-3
-MOST_STEPS = 20_000
+MAX_STEPS = 20_000
 
 
 class Case(NamedTuple):
@@ -246,7 +246,7 @@ def program(case: Case, solver, dtype=float, size=None, max_steps=None) -> Calla
 
 def runner(case: Case, solver, dtype=float) -> Callable:
     """A function (tolerance) -> positions, derivatives, steps, success and code at all stiffnesses of a case, in numpy."""
-    options = {"size": FIXED_STEP} if isinstance(solver, jd.solvers.RK4) else {"max_steps": MOST_STEPS}
+    options = {"size": FIXED_STEP} if isinstance(solver, jd.solvers.RK4) else {"max_steps": MAX_STEPS}
     run = jax.jit(jax.vmap(program(case, solver, dtype, **options), (0, None)))
     return lambda tolerance: tuple(
         np.asarray(x) for x in run(jnp.asarray(case.values, dtype), jnp.asarray(tolerance, dtype))
@@ -257,7 +257,7 @@ def reference(case: Case, one: Callable, other: Callable):
     """Positions at all stiffnesses, closed form where there is one, derivatives, and how far two methods differ there."""
     one, other = one(1e-10), other(1e-10)
     if not one[3].all():
-        raise RuntimeError(f"{case.name}: the reference needs more than {MOST_STEPS} steps at {case.values[~one[3]]}")
+        raise RuntimeError(f"{case.name}: the reference needs more than {MAX_STEPS} steps at {case.values[~one[3]]}")
     both = one[3] & other[3]
     differ = [np.abs(a - b)[both].max() / case.size for a, b in zip(one[:2], other[:2], strict=True)]
     q = one[0] if case.exact is None else np.stack([case.exact(k) for k in case.values])

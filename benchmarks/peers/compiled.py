@@ -27,7 +27,7 @@ from benchmarks.peers.steps import CORES, TOLERANCES, steps_between
 from jaxdyn.reports.run import Contestant, Motion
 
 COMPILER = shutil.which(os.environ.get("CC", "cc"))
-MOST_STEPS = 2**14
+MAX_STEPS = 2**14
 # Larger systems are solved by sparse QR with numbers; expanded into single operations, it loses digits of Andrews' mechanism.
 LARGEST = 8
 
@@ -112,7 +112,7 @@ def integrate(name: str, solver: str, times, states, *, steps: int = 0, toleranc
     at = lambda x: ctypes.c_void_p(x.ctypes.data)  # noqa: E731
     fails = library(name).run(
         size, ctypes.c_double(order), *map(at, arrays), batch, n, times.shape[1], at(times), at(states), at(rows), steps,
-        ctypes.c_double(tolerance), ctypes.c_long(MOST_STEPS), at(counts),
+        ctypes.c_double(tolerance), ctypes.c_long(MAX_STEPS), at(counts),
     )  # fmt: skip
     return rows, fails, counts
 
@@ -167,7 +167,7 @@ def _cvodes(prepared, equations: Equations, state) -> list[Contestant]:
     name, ts = prepared.case.name, prepared.reference.ts
     t, y = casadi.MX.sym("t"), casadi.MX.sym("y", len(state))
     problem = {"x": y, "t": t, "ode": slope(name)(t, y)}
-    options = {"linear_multistep_method": "bdf" if prepared.case.stiff else "adams", "max_num_steps": MOST_STEPS}
+    options = {"linear_multistep_method": "bdf" if prepared.case.stiff else "adams", "max_num_steps": MAX_STEPS}
     if COMPILER is not None:
         options |= {"jit": True, "compiler": "shell", "jit_options": {"compiler": COMPILER, "flags": ["-O3"]}}
 

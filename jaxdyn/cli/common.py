@@ -195,9 +195,9 @@ def whole(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at most 18 digits")
 
 
-def check_least(args: argparse.Namespace, **least: int) -> None:
+def check_minimum(args: argparse.Namespace, **minimum: int) -> None:
     """Check lower bounds of options, by their names in `args`. **Raises:** ValueError that names one."""
-    for name, bound in least.items():
+    for name, bound in minimum.items():
         values = getattr(args, name)
         for value in values if isinstance(values, list) else [] if values is None else [values]:
             if value < bound:
@@ -312,7 +312,7 @@ def connect(args: argparse.Namespace) -> Iterator[Any]:
 
     **Raises:** ValueError where no scheduler answers, for fewer than one worker, and where Dask is not installed.
     """
-    check_least(args, workers=1)
+    check_minimum(args, workers=1)
     if args.client is None and args.workers is None:
         yield None
         return

@@ -8,8 +8,8 @@ import numpy as np
 from jaxdyn import identify
 from jaxdyn.cli.common import (
     add_model_options,
-    check_least,
     check_memory,
+    check_minimum,
     load_mechanism,
     load_model,
     option,
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
     # Negated, so that NaN is refused.
     if not args.period > 0:
         raise ValueError(f"--period is {args.period} s; give a positive time")
-    check_least(args, harmonics=1, steps=0, seed=0)
+    check_minimum(args, harmonics=1, steps=0, seed=0)
     # Nyquist: rows must resolve the highest harmonic, or the log cannot represent the motion.
     if args.rate * args.period <= 2 * args.harmonics:
         raise ValueError(

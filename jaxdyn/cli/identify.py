@@ -12,7 +12,7 @@ from jaxdyn.cli.common import (
     Stopwatch,
     add_cluster_options,
     add_model_options,
-    check_least,
+    check_minimum,
     connect,
     load_for_repair,
     load_mechanism,
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> None:
     missing = [name for name, value in (("--urdf", args.urdf), ("--log", args.log)) if not value]
     if missing:
         raise ValueError(f"{' and '.join(missing)}: missing; give the robot's URDF file and at least one log")
-    check_least(args, every=1, trim=0, steps=0)
+    check_minimum(args, every=1, trim=0, steps=0)
     for name in ("payload_mass", "horizon"):
         # Negated, so that NaN is refused.
         if (value := getattr(args, name)) is not None and not value > 0:

@@ -3,7 +3,7 @@
 import argparse
 
 from jaxdyn import scenes
-from jaxdyn.cli.common import Stopwatch, check_least, check_memory, option, whole
+from jaxdyn.cli.common import Stopwatch, check_memory, check_minimum, option, whole
 from jaxdyn.reports import report
 
 HELP = "error against run time of scenes"
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if not args.scenes:
         raise ValueError(f"no scene is named; name one of {', '.join(scenes.names())}")
-    check_least(args, batch=1, rounds=1)
+    check_minimum(args, batch=1, rounds=1)
     check_memory(1000.0 * max(args.batch), f"--batch {max(args.batch)}")
     watch = Stopwatch()
     integrators = None if args.integrator is None else [tuple(pair.split(":")) for pair in args.integrator]

@@ -13,8 +13,8 @@ from jaxdyn.cli.common import (
     FILE,
     Stopwatch,
     add_model_options,
-    check_least,
     check_memory,
+    check_minimum,
     load_scene,
     option,
     output_path,
@@ -139,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"--batch is {args.batch}; give at least 1")
     if args.dt is not None and not args.dt > 0:
         raise ValueError(f"--dt is {args.dt}; give a positive step, s")
-    check_least(args, spread=0, max_steps=1, torque_size=0, damping=0, friction=0, rank_tol=0)
+    check_minimum(args, spread=0, max_steps=1, torque_size=0, damping=0, friction=0, rank_tol=0)
     loaded, file = load_scene(args.file, args)
     model = loaded.system
     # Before the starts and the torques of the batch are allocated, which happens ahead of the rows.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import scale, scenes
-from jaxdyn.cli.common import Stopwatch, add_cluster_options, check_least, check_memory, connect, option, whole
+from jaxdyn.cli.common import Stopwatch, add_cluster_options, check_memory, check_minimum, connect, option, whole
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.io import load
 from jaxdyn.model.arguments import as_path
@@ -115,7 +115,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and print its outcome; return 1 if a rollout failed."""
-    check_least(args, chunk=1, samples=1)
+    check_minimum(args, chunk=1, samples=1)
     path = as_path(args.study, "study")
     study = _read(path)
     if args.devices is not None:

@@ -27,7 +27,7 @@ T = TypeVar("T")
 # Rows that are computed together. It bounds the memory for operands and results of kernels.
 AT_ONCE = 16
 # Repetitions up to which code without JAX has them written out.
-MOST_WRITTEN_OUT = 16
+MAX_WRITTEN_OUT = 16
 
 
 @custom_vmap
@@ -63,24 +63,26 @@ def while_loop(goes_on: Callable[[T], object], body: Callable[[T], T], carry: T)
     return lax.while_loop(lambda carry: any_sample(goes_on(carry)), body, carry)
 
 
-def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, most: int, *, marks: bool = False) -> T:
-    """Repeat state = step(state) while goes_on(state), `most` times at most; few samples need more than a certain first time.
+def repeat_while(
+    goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, maximum: int, *, marks: bool = False
+) -> T:
+    """Repeat state = step(state) while goes_on(state), `maximum` times at most; few samples need more than a certain first time.
 
     The first repetition is certain where `goes_on(state)` is True itself. For others a native loop, and a kernel without a
     derivative, branches where a block of samples needs it; there many repetitions are a loop. Other kernels have no branches:
     samples that need a repetition are marked as not valid, and computed again outside of the kernel. In code without JAX many
     repetitions are a loop; a few are written out, or with `marks` such samples are left to its second program.
     """
-    if not is_expanding() or (is_standalone() and most > MOST_WRITTEN_OUT):
+    if not is_expanding() or (is_standalone() and maximum > MAX_WRITTEN_OUT):
         leaves, structure = jax.tree.flatten(state)
-        return _loop(goes_on, step, jax.tree.unflatten(structure, vary_alike([*map(jnp.asarray, leaves)])), most)
+        return _loop(goes_on, step, jax.tree.unflatten(structure, vary_alike([*map(jnp.asarray, leaves)])), maximum)
     if goes_on(state) is True:
-        state, most = step(state), most - 1
+        state, maximum = step(state), maximum - 1
     if not has_branches() and (marks or not is_standalone()) and not is_careful():
         return _mark(goes_on(state), state)
-    if has_branches() and most > MOST_WRITTEN_OUT:
-        return _loop(goes_on, step, state, most)
-    for _ in range(most):
+    if has_branches() and maximum > MAX_WRITTEN_OUT:
+        return _loop(goes_on, step, state, maximum)
+    for _ in range(maximum):
         flag = goes_on(state)
         if has_branches():
             state = lax.cond(flag, step, lambda state: state, state)
@@ -104,12 +106,12 @@ def _mark(flag, state: T) -> T:
     return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, state)
 
 
-def _loop(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, most: int) -> T:
+def _loop(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, maximum: int) -> T:
     def again(carry):
         count, state = carry
         return count + 1, step(state)
 
-    return lax.while_loop(lambda carry: goes_on(carry[1]) & (carry[0] < most), again, (0, state))[1]
+    return lax.while_loop(lambda carry: goes_on(carry[1]) & (carry[0] < maximum), again, (0, state))[1]
 
 
 def each_row(function: Callable, *rows):

@@ -235,7 +235,7 @@ _jit: Any = eqx.filter_jit
 # compile it and bring nothing at run time: `python -m benchmarks.first_calls`, and again with
 # JAXDYN_COMPILATION_OPTIONS=usual in the environment.
 _QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-_LEAST = _QUICK | {"xla_backend_optimization_level": 0}
+_MINIMUM = _QUICK | {"xla_backend_optimization_level": 0}
 
 
 @functools.cache
@@ -246,7 +246,7 @@ def quick_options() -> dict[str, Any] | None:
     """
     if mode.options() == "usual":
         return None
-    return select_options(_LEAST if mode.options() == "least" else _QUICK)
+    return select_options(_MINIMUM if mode.options() == "least" else _QUICK)
 
 
 def glue_options(platform: str) -> dict[str, Any] | None:

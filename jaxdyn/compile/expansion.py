@@ -38,7 +38,7 @@ MIN_SUBPROGRAM_OPERATIONS = 300
 
 
 def expand(
-    closed: ClosedJaxpr, most: int, name: str = "", calls: bool = False, flags: str = "refuse"
+    closed: ClosedJaxpr, maximum: int, name: str = "", calls: bool = False, flags: str = "refuse"
 ) -> tuple[Program, bool]:
     """The program of a jaxpr, and whether it has functions whose derivatives are given by rules of their own.
 
@@ -51,7 +51,7 @@ def expand(
 
     **Raises:** `NotNumbers`, `TooLong`.
     """
-    graph = Graph(most)
+    graph = Graph(maximum)
     inputs = _arrays_of(closed.jaxpr.invars)
     outputs = _arrays_of(closed.jaxpr.outvars)
     for array in (*inputs, *outputs):
@@ -184,7 +184,7 @@ class _Expansion:
     def _subprogram(self, inner: ClosedJaxpr, args) -> tuple[Program, list]:
         """A function as a subprogram, and its arguments without the known ones, which are compiled in."""
         known = tuple(None if x.dtype.kind == "O" else (x.dtype.str, x.tobytes()) for x in args)
-        program, has_rules = _subprogram(inner, known, self.graph.most)
+        program, has_rules = _subprogram(inner, known, self.graph.maximum)
         self.has_rules |= has_rules
         program, places = without_unread(program)
         given = [x for x in args if x.dtype.kind == "O"]
@@ -352,14 +352,14 @@ def _arrays_of(variables: Any) -> list[Array]:
 
 
 @functools.lru_cache(maxsize=256)
-def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, bool]:
+def _subprogram(inner: ClosedJaxpr, known: tuple, maximum: int) -> tuple[Program, bool]:
     """The program of a function that others call, and whether it has rules.
 
     `known`: dtypes and bytes of the arguments that are known, None for others. Where numbers may be flagged, there is one more
     output, which says whether one is.
     """
     # By the identity of the jaxpr, which JAX keeps for a function under `jit`: of all calls of a function one program is made.
-    graph = Graph(most)
+    graph = Graph(maximum)
     arrays = _arrays_of(inner.jaxpr.invars)
     # A subprogram makes no calls of its own but branches: only programs that have both call it.
     expansion, inputs, args = _Expansion(graph, False, True), [], []

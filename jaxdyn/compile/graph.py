@@ -35,14 +35,14 @@ from jaxdyn.compile.program import (
 # Numbers that may be made for each operation that is allowed: those that no output needs are dropped at the end. Without a
 # bound a function that explodes would fill the memory before the count of operations refuses it.
 _MADE_FOR_ONE_KEPT = 3
-_LEAST_NORMAL = {"f8": 2.0**-1022, "f4": 2.0**-126}
+_MIN_NORMAL = {"f8": 2.0**-1022, "f4": 2.0**-126}
 
 
 class Graph:
-    """A program while it is written. **Raises:** `TooLong` beyond `most` operations."""
+    """A program while it is written. **Raises:** `TooLong` beyond `maximum` operations."""
 
-    def __init__(self, most: int = 10**9):
-        self.most, self.most_made = most, _MADE_FOR_ONE_KEPT * most
+    def __init__(self, maximum: int = 10**9):
+        self.maximum, self.max_made = maximum, _MADE_FOR_ONE_KEPT * maximum
         self.numbers: list[Number] = []
         # For each operation and kind, numbers by their operands, by identity: equal numbers are made once.
         self.shared: dict[tuple[str, str], dict[tuple, Number]] = defaultdict(dict)
@@ -60,8 +60,8 @@ class Graph:
         return self._new(op, kind, args, key, made) if number is None else number
 
     def _new(self, op: str, kind: str, args: tuple, key: tuple, made: dict) -> Number:
-        if len(self.numbers) >= self.most_made:
-            raise TooLong(f"more than {self.most} operations")
+        if len(self.numbers) >= self.max_made:
+            raise TooLong(f"more than {self.maximum} operations")
         number = made[key] = Number(self, op, kind, args)
         self.numbers.append(number)
         return number
@@ -190,8 +190,8 @@ class Graph:
         if type(b) is not Number:
             if type(a) is not Number:
                 return with_type(np.divide(a, b))  # of zero too, where Python's own division raises
-            least = _LEAST_NORMAL[a.kind]
-            if math.frexp(b)[0] in (0.5, -0.5) and least <= abs(b) <= 1 / least:
+            minimum = _MIN_NORMAL[a.kind]
+            if math.frexp(b)[0] in (0.5, -0.5) and minimum <= abs(b) <= 1 / minimum:
                 return self.mul(a, 1 / b)  # by a power of two, whose inverse is exact
             return self.make("div", a.kind, a, b)
         # A known zero is divided: 0 / b is not a number where b is zero. Left out it saves no operation of any robot.
@@ -369,8 +369,8 @@ class Graph:
                 args = tuple([x.place if type(x) is Number else new(Constant, (x,)) for x in args])
             operations.append((op, kind, args))
             count += op not in ("input", "part")  # these are memory
-        if count > self.most:
-            raise TooLong(f"more than {self.most} operations")
+        if count > self.maximum:
+            raise TooLong(f"more than {self.maximum} operations")
         results = [tuple([x.place if type(x) is Number else Constant(x) for x in row]) for row in flat]
         return Program(inputs, outputs, operations, results, [self.subprograms[i] for i in called], **more)
 

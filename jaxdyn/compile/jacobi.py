@@ -31,7 +31,7 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 MAX_SWEEPS = 60
 # Share of a diagonal entry that elimination without exchange of rows has to leave as a pivot, and relative error of its inverse
 # from which on samples are computed with exchanges.
-_LEAST_SHARE = 1e-4
+_MIN_SHARE = 1e-4
 
 
 def _cost(n: int, m: int) -> int:
@@ -42,27 +42,27 @@ def _cost(n: int, m: int) -> int:
 class PseudoInverse(MatrixProgram):
     """A (rows, columns) -> its pseudo-inverse (columns, rows).
 
-    By normal equations where the least of their pivots is above `least` times the largest; by rotations elsewhere, or for None.
+    By normal equations where the least of their pivots is above `minimum` times the largest; by rotations elsewhere, or for None.
     """
 
     name = "pseudo_inverse"
 
-    def __init__(self, rows: int, columns: int, dtype, tolerance: float, least: float | None = None):
+    def __init__(self, rows: int, columns: int, dtype, tolerance: float, minimum: float | None = None):
         super().__init__(rows, columns, (columns, rows), dtype, tolerance)
-        self.least = least
+        self.minimum = minimum
         n, m = max(rows, columns), min(rows, columns)
-        self.cost = _cost(n, m) if least is None else 8 * n * m * m + 1
+        self.cost = _cost(n, m) if minimum is None else 8 * n * m * m + 1
 
     @property
     def title(self) -> str:
         """Text that names all on which the code depends."""
-        return super().title if self.least is None else f"{super().title}, pivots above {self.least!r}"
+        return super().title if self.minimum is None else f"{super().title}, pivots above {self.minimum!r}"
 
     def write(self, w: LoopWriter, matrix, result) -> None:
         """Normal equations, then rotations where these are poor."""
-        if self.least is None:
+        if self.minimum is None:
             return self._write_by_rotations(w, matrix, result)
-        is_accurate = write_normal_equations(w, matrix, result, self.rows, self.columns, self.least)
+        is_accurate = write_normal_equations(w, matrix, result, self.rows, self.columns, self.minimum)
         with w.b.if_then(w.b.not_(is_accurate)):
             self._write_by_rotations(w, matrix, result)
 
@@ -129,11 +129,11 @@ class RightVectors(MatrixProgram):
         # Rotations pass over numbers that are not finite: without this the vectors would be those of the identity.
         invalid = b.fsub(w.load(total), w.load(total))
         with w.loop(w.integer(0), w.integer(m)) as place:
-            most, index = w.variable(w.float, w.number(-1)), w.variable(INT, w.integer(0))
+            maximum, index = w.variable(w.float, w.number(-1)), w.variable(INT, w.integer(0))
             with w.loop(w.integer(0), w.integer(m)) as p:
                 square = w.load(w.at(squares, (p, 1)))
-                with b.if_then(b.fcmp_ordered(">", square, w.load(most))):
-                    b.store(square, most)
+                with b.if_then(b.fcmp_ordered(">", square, w.load(maximum))):
+                    b.store(square, maximum)
                     b.store(p, index)
             p = b.load(index, typ=INT)
             b.store(w.number(-2), w.at(squares, (p, 1)))
@@ -206,12 +206,12 @@ def pseudo_inverse_by_rotations(matrix: jax.Array, tolerance: float) -> jax.Arra
     return _pseudo_inverse(*matrix.shape, matrix.dtype, float(tolerance))(matrix)
 
 
-def pseudo_inverse_by_pivots(matrix: jax.Array, tolerance: float, least: float) -> jax.Array:
+def pseudo_inverse_by_pivots(matrix: jax.Array, tolerance: float, minimum: float) -> jax.Array:
     """`pseudo_inverse_by_rotations` of a matrix (n, m) with n >= m, by normal equations where these are accurate.
 
-    They are where their least pivot is above `least` times the largest. Columns of zeros have no pivot.
+    They are where their least pivot is above `minimum` times the largest. Columns of zeros have no pivot.
     """
-    return _pseudo_inverse(*matrix.shape, matrix.dtype, float(tolerance), float(least))(matrix)
+    return _pseudo_inverse(*matrix.shape, matrix.dtype, float(tolerance), float(minimum))(matrix)
 
 
 @jax.custom_jvp
@@ -265,7 +265,7 @@ def _inverse_without_exchange(matrix):
     # Different entries, so that a symmetric mechanism hides nothing.
     factor = jnp.linspace(1.0, 2.0, n, dtype=matrix.dtype)
     off = jnp.matmul(result, jnp.matmul(matrix, factor, precision="highest"), precision="highest") - factor
-    is_good = jnp.all(jnp.abs(pivots) > _LEAST_SHARE * sizes) & jnp.all(jnp.abs(off) < _LEAST_SHARE)
+    is_good = jnp.all(jnp.abs(pivots) > _MIN_SHARE * sizes) & jnp.all(jnp.abs(off) < _MIN_SHARE)
     return mark_invalid(~is_good, result)
 
 
@@ -309,8 +309,8 @@ def _orthogonalise(w: LoopWriter, matrix, n: int, m: int, of_vector: int, of_ent
 # what their other entries do.
 
 
-def write_normal_equations(w: LoopWriter, matrix, result, n: int, m: int, least: float):
-    """Write the inverse (m, n) of Y (n, m), and whether it is accurate: its least pivot above `least` times the largest.
+def write_normal_equations(w: LoopWriter, matrix, result, n: int, m: int, minimum: float):
+    """Write the inverse (m, n) of Y (n, m), and whether it is accurate: its least pivot above `minimum` times the largest.
 
     Gram matrix, Cholesky factor R^T R, two triangular solutions, and a step of Newton and Schulz, which restores the accuracy of
     an orthogonal method: normal equations square the condition number.
@@ -327,7 +327,7 @@ def write_normal_equations(w: LoopWriter, matrix, result, n: int, m: int, least:
         b.store(b.select(b.fcmp_ordered(">", square, so_far), square, so_far), largest)
     # Columns of zeros, which are of rows that were dropped, get the largest square, so that theirs is never the least pivot.
     fill = b.select(b.fcmp_ordered(">", w.load(largest), w.number(0)), w.load(largest), one)
-    most, fewest = w.variable(w.float, w.number(0)), w.variable(w.float, fill)
+    maximum, fewest = w.variable(w.float, w.number(0)), w.variable(w.float, fill)
     minus, inverses = w.buffer(m), w.buffer(m)
     with w.loop(zero, rows) as i:
         own = w.at(R.memory, (i, R.stride))
@@ -339,7 +339,7 @@ def write_normal_equations(w: LoopWriter, matrix, result, n: int, m: int, least:
         pivot = b.select(b.fcmp_ordered("==", square, w.number(0)), fill, pivot)
         # What is not a number replaces the least, and is in all later rows.
         b.store(b.select(b.fcmp_unordered("<", pivot, w.load(fewest)), pivot, w.load(fewest)), fewest)
-        b.store(b.select(b.fcmp_ordered(">", pivot, w.load(most)), pivot, w.load(most)), most)
+        b.store(b.select(b.fcmp_ordered(">", pivot, w.load(maximum)), pivot, w.load(maximum)), maximum)
         inverse = b.fdiv(one, w.root(pivot))
         b.store(inverse, w.at(inverses, (i, 1)))
         w.add_rows(own, R, minus, 1, zero, zero, start=own, scale=inverse, first=i)
@@ -373,4 +373,4 @@ def write_normal_equations(w: LoopWriter, matrix, result, n: int, m: int, least:
         w.add_rows(improved, X, w.at(Et.memory, (i, 1)), Et.stride, zero, rows, start=w.at(X.memory, (i, X.stride)))
         with w.loop(zero, w.integer(n)) as k:
             b.store(w.load(w.at(improved, (k, 1))), w.at(result, (i, n), (k, 1)))
-    return b.fcmp_ordered(">", b.fdiv(w.load(fewest), w.load(most)), w.number(least))
+    return b.fcmp_ordered(">", b.fdiv(w.load(fewest), w.load(maximum)), w.number(minimum))

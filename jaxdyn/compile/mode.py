@@ -77,7 +77,7 @@ def compilation(mode: str) -> Iterator[None]:
         yield
 
 
-def most_operations(arrays) -> int:
+def max_operations(arrays) -> int:
     """Operations beyond which a function of these arrays is no program."""
     return max(MAX_OPERATIONS, MAX_OPERATIONS_PER_ENTRY * sum(math.prod(x.shape) for x in arrays))
 

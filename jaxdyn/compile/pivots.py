@@ -18,16 +18,16 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 from jax.scipy.linalg import solve_triangular
 
 # Unknowns up to which an elimination is written out.
-_MOST_WRITTEN_OUT = 24
+_MAX_WRITTEN_OUT = 24
 # Rows of a matrix up to which its Cholesky factor is written out, with several samples in a vector: operations grow as the cube.
 # Loops over its rows are as fast from 40 rows on, and compile in a tenth of the time.
-_MOST_FACTORED = 32
+_MAX_FACTORED = 32
 # Rows whose distances differ by less than this part are equally far.
 _ALIKE = 1e-3
 
 
 class IndependentRows(MatrixProgram):
-    """Rows (n, m), and beside each `first`, `least` and `most` -> three numbers a row.
+    """Rows (n, m), and beside each `first`, `minimum` and `maximum` -> three numbers a row.
 
     These are whether it is kept, its distance from the rows that are, and, of one that is kept, its pivot, else zero.
     """
@@ -50,14 +50,14 @@ class IndependentRows(MatrixProgram):
                 b.store(w.number(0), w.at(result, (i, 3), (w.integer(k), 1)))
         w.copy_rows(matrix, m + 3, 1, rows)
 
-        def enlarge(most, x):
+        def enlarge(maximum, x):
             """Store the larger one; what is not a number stays, as in JAX."""
-            with b.if_then(b.or_(b.fcmp_ordered(">", x, w.load(most)), b.fcmp_unordered("uno", x, x))):
-                b.store(x, most)
+            with b.if_then(b.or_(b.fcmp_ordered(">", x, w.load(maximum)), b.fcmp_unordered("uno", x, x))):
+                b.store(x, maximum)
 
         def measure():
             """Lengths of what is left of each row, and the largest."""
-            most = w.variable(w.float, w.number(0))
+            maximum = w.variable(w.float, w.number(0))
             with w.loop(zero, w.integer(n)) as i:
                 row = w.at(rest, (i, stride))
                 # Rounding leaves a kept row a length of eps; it must not be chosen again.
@@ -65,16 +65,16 @@ class IndependentRows(MatrixProgram):
                     w.root(w.multiply_rows(row, row, rows)), b.fsub(w.number(1), w.load(w.at(result, (i, 3))))
                 )
                 b.store(length, w.at(lengths, (i, 1)))
-                enlarge(most, length)
-            return w.load(most)
+                enlarge(maximum, length)
+            return w.load(maximum)
 
         with w.loop(zero, w.integer(min(n, m))) as _:
             largest = measure()
             size, index, is_found = w.variable(w.float, w.number(-1)), w.variable(INT, zero), w.variable(INT, zero)
             with w.loop(zero, w.integer(n)) as i:
-                first, least = (w.load(w.at(matrix, (i, m + 3), (w.integer(m + k), 1))) for k in range(2))
+                first, minimum = (w.load(w.at(matrix, (i, m + 3), (w.integer(m + k), 1))) for k in range(2))
                 length = w.load(w.at(lengths, (i, 1)))
-                is_first = b.and_(b.fcmp_ordered(">", first, w.number(0)), b.fcmp_ordered(">", length, least))
+                is_first = b.and_(b.fcmp_ordered(">", first, w.number(0)), b.fcmp_ordered(">", length, minimum))
                 length = b.select(is_first, b.fadd(length, largest), length)
                 b.store(length, w.at(orders, (i, 1)))
                 enlarge(size, length)
@@ -85,9 +85,9 @@ class IndependentRows(MatrixProgram):
                     b.store(w.integer(1), is_found)
                     b.store(i, index)
             row = b.load(index, typ=INT)
-            least, most = (w.load(w.at(matrix, (row, m + 3), (w.integer(m + k), 1))) for k in (1, 2))
+            minimum, maximum = (w.load(w.at(matrix, (row, m + 3), (w.integer(m + k), 1))) for k in (1, 2))
             pivot = w.load(w.at(lengths, (row, 1)))
-            is_kept = b.and_(b.fcmp_ordered(">", pivot, least), b.fcmp_ordered("<", w.load(count), most))
+            is_kept = b.and_(b.fcmp_ordered(">", pivot, minimum), b.fcmp_ordered("<", w.load(count), maximum))
             with b.if_then(is_kept):
                 b.store(b.fadd(w.load(count), w.number(1)), count)
                 b.store(w.number(1), w.at(result, (row, 3)))
@@ -133,37 +133,37 @@ class IndependentRows(MatrixProgram):
 _independent_rows = functools.lru_cache(maxsize=256)(IndependentRows)
 
 
-def eliminate_rows(B: jax.Array, first: jax.Array, least, most) -> tuple[jax.Array, jax.Array, jax.Array]:
+def eliminate_rows(B: jax.Array, first: jax.Array, minimum, maximum) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Independent rows of B (n, m) by elimination with pivots.
 
     The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` (n,) = 1 come before
-    all others, and of rows that are equally far the first one. A row is kept where its pivot is above `least`, and `most` rows
-    at most.
+    all others, and of rows that are equally far the first one. A row is kept where its pivot is above `minimum`, and
+    `maximum` rows at most.
 
     **Returns:** a mask (n,) of 1 and 0, the distances (n,) of the others from the span of these, and the pivots (n,) of these.
     None has a derivative.
     """
-    numbers = [jnp.broadcast_to(jnp.asarray(x, B.dtype), first.shape) for x in (first, least, most)]
+    numbers = [jnp.broadcast_to(jnp.asarray(x, B.dtype), first.shape) for x in (first, minimum, maximum)]
     chosen = _independent_rows(*B.shape, B.dtype)(jnp.concatenate([B, jnp.stack(numbers, 1)], 1))
     return chosen[:, 0], chosen[:, 1], chosen[:, 2]
 
 
-def eliminate(matrix: jax.Array, right: jax.Array, least: float) -> tuple[jax.Array, jax.Array]:
+def eliminate(matrix: jax.Array, right: jax.Array, minimum: float) -> tuple[jax.Array, jax.Array]:
     """Solution of matrix x = right (n, k) by elimination without exchange of rows, and the pivots (n,).
 
-    A pivot whose size is at most `least` is replaced by it. Many unknowns are eliminated by a loop: the operations of what is
+    A pivot whose size is at most `minimum` is replaced by it. Many unknowns are eliminated by a loop: the operations of what is
     written out grow with their third power.
     """
     n = len(matrix)
-    if n > _MOST_WRITTEN_OUT:
+    if n > _MAX_WRITTEN_OUT:
         # Two carries: of a derivative the right side alone is linear.
-        (_, right), pivots = lax.scan(functools.partial(_clear_column, least), (matrix, right), None, n)
+        (_, right), pivots = lax.scan(functools.partial(_clear_column, minimum), (matrix, right), None, n)
         return right, pivots
     rows, pivots = [], []
     for _ in range(n):
         pivot = matrix[0, 0]
         pivots.append(pivot)
-        inverse = 1 / jnp.where(jnp.abs(pivot) > least, pivot, least)
+        inverse = 1 / jnp.where(jnp.abs(pivot) > minimum, pivot, minimum)
         rows.append((inverse, matrix[0, 1:], right[0]))
         share = matrix[1:, :1] * inverse
         matrix, right = matrix[1:, 1:] - share * matrix[:1, 1:], right[1:] - share * right[:1]
@@ -180,7 +180,7 @@ def solver_of(matrix: jax.Array) -> Callable[[jax.Array], jax.Array]:
     Elimination without exchange of rows, as for `eliminate`.
     """
     inverse = None
-    if len(matrix) > _MOST_WRITTEN_OUT:
+    if len(matrix) > _MAX_WRITTEN_OUT:
         # Products transpose well. A loop that eliminates would keep the matrix of each of its steps.
         unit = jnp.eye(len(matrix), dtype=matrix.dtype)
         inverse = lax.stop_gradient(eliminate(matrix, unit, float(jnp.finfo(matrix.dtype).eps))[0])
@@ -202,11 +202,11 @@ def _solve_regular_jvp(primals, tangents):
     return solution, _solve_regular(*primals[:2], rest)
 
 
-def _clear_column(least: float, state, _):
+def _clear_column(minimum: float, state, _):
     """A step of Gauss and Jordan on the first row and column, which become the last ones; after n of them all are in place."""
     matrix, right = state
     pivot = matrix[0, 0]
-    scale = jnp.where(jnp.abs(pivot) > least, pivot, least)
+    scale = jnp.where(jnp.abs(pivot) > minimum, pivot, minimum)
     row, value = matrix[:1, 1:] / scale, right[:1] / scale
     rest = jnp.concatenate([matrix[1:, 1:] - matrix[1:, :1] * row, row])
     # The first column is zero from here on, and is not read again.
@@ -313,7 +313,7 @@ def cholesky_factor(matrix: jax.Array) -> jax.Array:
     """The lower triangular L (n, n) with L L^T = matrix, of which the lower triangle is read; NaN where it is not definite."""
     if mode.is_expanding():
         return _factor(None, matrix)
-    return kernel(_factor)(None, matrix) if len(matrix) <= _MOST_FACTORED else _factor_by_loops(matrix)
+    return kernel(_factor)(None, matrix) if len(matrix) <= _MAX_FACTORED else _factor_by_loops(matrix)
 
 
 def _factor(_, matrix):
@@ -340,7 +340,7 @@ def triangular_solution(factor: jax.Array, right: jax.Array, transposed: bool = 
     """L^-1 right (n, ...), or L^-T right, for a lower triangular L (n, n)."""
     if mode.is_expanding():
         return _solve(transposed, None, factor, right)
-    is_large = max(factor.size, right.size) > _MOST_FACTORED**2
+    is_large = max(factor.size, right.size) > _MAX_FACTORED**2
     return (
         _solve_by_loops(factor, right, transposed)
         if is_large

@@ -178,7 +178,7 @@ AT_PLACES: dict[str, Callable] = {
 
 
 # A look-up among more places is left to JAX: each one costs a comparison and a selection in every call.
-MOST_PLACES = 256
+MAX_PLACES = 256
 
 
 def at_place(rule, expansion, params, args, eqn):
@@ -344,7 +344,7 @@ def _rounds(g: Graph, starts: np.ndarray, ranges: Sequence[range], eqn) -> Itera
     for column, values in zip(rows.T.tolist(), ranges, strict=True):
         known = sorted({int(x) for x in column if not is_number(x)})
         choices.append(known if len(known) and all(not is_number(x) for x in column) else values)
-    if (count := math.prod(map(len, choices))) > MOST_PLACES:
+    if (count := math.prod(map(len, choices))) > MAX_PLACES:
         raise NotNumbers(f"{eqn.primitive.name} at one of {count} places that is not known")
     for place in itertools.product(*choices):
         flags = []

@@ -60,14 +60,14 @@ def scan(expansion, params, args, eqn):
     return [*carry, *(_stack(column) for column in zip(*saved, strict=True))]
 
 
-def _roll(expansion, body: ClosedJaxpr, arrays, eqn, length: int, inward: bool, parents, most: int) -> list | None:
+def _roll(expansion, body: ClosedJaxpr, arrays, eqn, length: int, inward: bool, parents, maximum: int) -> list | None:
     """Results of a loop as a call of a subprogram; None where it is short enough to be written out.
 
     **Arguments:**
 
     - `body`: the jaxpr of one iteration, from constants, carries and a row of each array to carries and rows.
     - `arrays`: constants, carries, and rows (length, ...).
-    - `most`: operations of a loop that is written out.
+    - `maximum`: operations of a loop that is written out.
 
     **Returns:** carries, and rows (length, ...), as those of `lax.scan`.
     """
@@ -78,7 +78,7 @@ def _roll(expansion, body: ClosedJaxpr, arrays, eqn, length: int, inward: bool, 
     rows = [_group(_columns(x), x[0, ...], d) for x, d in zip(rows, of_rows, strict=True)]
     carried = _Carries([as_objects(x) for x in carries], of_carries)
     while True:
-        inner, types = Graph(expansion.graph.most), []
+        inner, types = Graph(expansion.graph.maximum), []
 
         def make(arrays, inner=inner, types=types):
             first = len(types)
@@ -107,7 +107,7 @@ def _roll(expansion, body: ClosedJaxpr, arrays, eqn, length: int, inward: bool, 
     program = inner.finish(types, outputs, [*carried.outputs(ends), *made])
     # A call counts as one operation: its code exists once. A loop of long iterations would compile for as long as what is written
     # out, which then is refused as too long.
-    if len(program.operations) * length <= most or (most and len(program.operations) > MAX_LOOP_BODY):
+    if len(program.operations) * length <= maximum or (maximum and len(program.operations) > MAX_LOOP_BODY):
         return None
     tables = [np.stack([np.array(y, x.dtype) for y in x.known], 1) for x in rows if x.known]
     counts = Counts(len(own_consts), len(own_carries), len(own_rows), len(tables), 0, len(kept))
@@ -177,7 +177,7 @@ def _roll_while(expansion, params, arrays: Sequence[Sequence], eqn) -> list:
 
     def start():
         """A graph, the types of its inputs, constants and carries."""
-        inner = Graph(expansion.graph.most)
+        inner = Graph(expansion.graph.maximum)
         types = [*(Array((len(x.passed),), x.dtype) for x in consts if x.passed), *carried.types]
         made = [inner.inputs(i, x) for i, x in enumerate(types)]
         count = len(types) - len(carried.types)

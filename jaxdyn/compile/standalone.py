@@ -88,7 +88,7 @@ def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> t
     call.__qualname__ = name
     try:
         # Validity is reported always: the exported function has a status, whether samples can be invalid or not.
-        _, made = program_of(call, (), (), tuple(examples), most=MAX_OPERATIONS, flags="report_always")
+        _, made = program_of(call, (), (), tuple(examples), maximum=MAX_OPERATIONS, flags="report_always")
     except _DATA_DEPENDENT as error:
         made = f"shapes, branches or conversions to numpy that depend on data ({str(error).splitlines()[0]})"
     if isinstance(made, str):

@@ -44,7 +44,7 @@ class Entry(ctypes.Structure):
         ("hash", ctypes.c_uint64),
         ("kernel", ctypes.c_uint64),
         ("chunk", ctypes.c_int64),
-        ("least", ctypes.c_int64),
+        ("minimum", ctypes.c_int64),
         ("buffers", ctypes.c_int64),
         ("sizes", ctypes.c_uint64),
     )
@@ -221,7 +221,7 @@ class _Kernel:
         self.is_awaited = False  # whether a worker is to compile it (see `mode`)
         self.sizes = (ctypes.c_int64 * len(row.sizes))(*row.sizes)
         self.entry = free_entry(_table, number)
-        self.entry.kernel, self.entry.chunk, self.entry.least = 0, row.chunk, 2 * row.chunk
+        self.entry.kernel, self.entry.chunk, self.entry.minimum = 0, row.chunk, 2 * row.chunk
         self.entry.buffers, self.entry.sizes = len(row.sizes), ctypes.addressof(self.sizes)
         self.entry.hash = number  # last: from here on it is found
 

@@ -41,7 +41,7 @@ def program_of(function: Callable, static: tuple, tree, args: tuple, **how):
 def trace_program(
     *parts,
     tangent: Callable | None = None,
-    most: int | None = None,
+    maximum: int | None = None,
     calls: bool = False,
     flags: str = "refuse",
     fallback: Callable | None = None,
@@ -53,23 +53,23 @@ def trace_program(
     - `parts`: function, static arguments, `Known` leaves of the tree and the number of its traced ones, structure of the other
       arguments, shapes and dtypes of all operands.
     - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
-    - `most`: operations beyond which there is no program; by default as `mode` says.
+    - `maximum`: operations beyond which there is no program; by default as `mode` says.
     - `calls`: whether long functions under `jax.jit` become subprograms.
     - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the
       function itself, which is traced when the first of them appears (see `careful`).
     """
     # A trace depends on these settings too: they are a part of the key under which the program is kept.
     context = jax.config.read("jax_enable_x64"), mode.state_of_programs()
-    return _trace_program(*parts, tangent, most, calls, flags, fallback, context)
+    return _trace_program(*parts, tangent, maximum, calls, flags, fallback, context)
 
 
 @functools.lru_cache(maxsize=1024)
-def _trace_program(function, static, known: Known, count, structure, shapes, tangent, most, calls, flags, fallback,
+def _trace_program(function, static, known: Known, count, structure, shapes, tangent, maximum, calls, flags, fallback,
                    context):  # fmt: skip
     del context  # part of the key alone
     is_pair, flags = flags == "repair", "report" if flags == "repair" else flags
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
-    most = mode.most_operations(avals) if most is None else most
+    maximum = mode.max_operations(avals) if maximum is None else maximum
     flat = function_of_leaves(function, static, known, count, structure)
 
     def make():
@@ -79,7 +79,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
                 # Subprograms are the functions under `jit` within this one; itself it is not a call.
                 traced = flat_function(function, static, known, count, structure) if calls else flat
                 closed, out = jax.make_jaxpr(traced, return_shape=True)(*avals)
-            program, has_rules = expand(closed, most, name_of(function), calls, flags)
+            program, has_rules = expand(closed, maximum, name_of(function), calls, flags)
         except (NotNumbers, TooLong) as reason:
             return [], str(reason)
         except Exception as error:
@@ -98,7 +98,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
         count,
         structure,
         shapes,
-        most,
+        maximum,
         calls,
         flags,
     )
@@ -175,8 +175,8 @@ def _make_careful(again: Again, outputs, key: str | None) -> Program:
         with phase("tracing"), mode.expanding(again.calls):
             closed = jax.make_jaxpr(compute)(*avals)
         # The marks of what is left as it is are NaN, which the results then are too.
-        most, name = 10 * mode.most_operations(avals), name_of(again.function)
-        program, has_rules = expand(closed, most, name, again.calls, "ignore")
+        maximum, name = 10 * mode.max_operations(avals), name_of(again.function)
+        program, has_rules = expand(closed, maximum, name, again.calls, "ignore")
         return [program], has_rules
 
     (program,), has_rules = stored.load_or_make(key, make)
@@ -303,7 +303,7 @@ def tangent_program(change: Callable, avals, moving, flags: str, key: str | None
             closed = jax.make_jaxpr(change)(*avals)
         # A tangent has two to four times the operations of the values. The bound is there for those that explode.
         of_tangent = flags if flags in ("refuse", "report") else "ignore"
-        program, has_rules = expand(closed, 10 * mode.most_operations(avals), "change", flags=of_tangent)
+        program, has_rules = expand(closed, 10 * mode.max_operations(avals), "change", flags=of_tangent)
         return [program], has_rules
 
     (program,), has_rules = stored.load_or_make(key, make)

@@ -19,7 +19,7 @@ from jaxdyn.constraints.closing import follow_path, nearest_configuration, polis
 from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
-from jaxdyn.constraints.rank import CLOSED, LEAST_GAP, check_tolerance, clear_pivot, tolerance
+from jaxdyn.constraints.rank import CLOSED, MIN_GAP, check_tolerance, clear_pivot, tolerance
 from jaxdyn.constraints.redundancy import (
     add_constraints,
     changes_branch,
@@ -30,7 +30,7 @@ from jaxdyn.constraints.redundancy import (
     row_limits,
     unit_size_rows,
 )
-from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
+from jaxdyn.constraints.selection import hide_unclear, max_rounding, select_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_static, check_count, check_mapping, check_state, zeros_if_none
 from jaxdyn.systems.scene import Scene, as_scene, is_given
@@ -176,7 +176,7 @@ def assemble(
         if name_of(assembly.result) == "unclear_rank":
             return (
                 f"assembled with residuals {np.asarray(assembly.residual)}, but the rank of the constraints is not clear: rows "
-                f"that are independent of the others differ by less than a factor of {LEAST_GAP:g} from rows that repeat them; "
+                f"that are independent of the others differ by less than a factor of {MIN_GAP:g} from rows that repeat them; "
                 "give numbers with more digits, a rank_tol between them, or throw=False"
             )
         if name_of(assembly.result) == "not_nearest":
@@ -249,7 +249,7 @@ def _select_near(bare: Scene, guess, t, rank_tol, steps: int) -> tuple[Any, Any,
         # the constraints rows that repeat others are independent.
         start = _close_kept_rows(bare, selection, start, t)
         again = select_rows(bare, start, t)
-        is_clear = again.gap >= LEAST_GAP
+        is_clear = again.gap >= MIN_GAP
         selection = jax.tree.map(lambda x, y: jnp.where(is_clear, x, y), again, selection)._replace(gap=again.gap)
     return start, passed, selection
 
@@ -279,7 +279,7 @@ def _close_kept_rows(bare: Scene, selection, start, t):
 
 def _drop_rows(bare: Scene, selection, dtype) -> Scene:
     """`keep_rows`, with all rows where those to drop contradict the others: the result is then the point of least squares."""
-    kept = jnp.where(selection.rounding <= most_rounding(dtype), selection.kept, jnp.ones_like(selection.kept))
+    kept = jnp.where(selection.rounding <= max_rounding(dtype), selection.kept, jnp.ones_like(selection.kept))
     return keep_rows(bare, selection._replace(kept=kept))
 
 
@@ -289,7 +289,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     whole, locked, is_clear = bare, bare, jnp.asarray(True)
     kept = jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype)
     if selection is not None:
-        locked, is_clear = _drop_rows(bare, selection, guess.dtype), jnp.asarray(selection.gap >= LEAST_GAP)
+        locked, is_clear = _drop_rows(bare, selection, guess.dtype), jnp.asarray(selection.gap >= MIN_GAP)
         kept = locked.kept_rows.kept
     q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
@@ -307,7 +307,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     phi = position_residual(locked, q, t)
     is_closed = jnp.all(jnp.abs(phi) <= limits)
     if selection is not None:
-        is_closed &= opening_of_redundant(locked, q, t) <= most_rounding(q.dtype)
+        is_closed &= opening_of_redundant(locked, q, t) <= max_rounding(q.dtype)
     is_admissible = jnp.all(jnp.abs(slips) <= admissible)
     residual = _sizes(position_residual(whole, q, t), slips)
     good = (is_closed if atol is None else is_closed | (residual[0] <= atol)) & is_admissible
@@ -368,11 +368,11 @@ def open_constraints(scene: Scene, q, v, t: Numbers = 0.0, relative: float = 0.0
     for constraint, place in zip(scene.constraints, layout(scene), strict=True):
         count = place.nonholonomic - place.start
         kind = type(constraint).__name__.lower()
-        for values, most, rows, words in (
+        for values, maximum, rows, words in (
             (phi, limits[0], slice(first, first + count), "open by"),
             (psi, limits[1], slice(place.start, place.end), "slips at"),
         ):
-            if not np.all(np.abs(values[rows]) <= most[rows]):  # NaN is open
+            if not np.all(np.abs(values[rows]) <= maximum[rows]):  # NaN is open
                 size = float(np.max(np.abs(values[rows])))
                 residuals.append((size, f"{kind} {place.name!r} {words} {size:.3g}"))
         first += count

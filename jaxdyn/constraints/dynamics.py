@@ -25,8 +25,8 @@ from jaxdyn.constraints.rank import (
     check_tolerance,
     eps_of,
     has_clear_rank,
-    least_pivot,
-    least_refinable_pivot,
+    min_pivot,
+    min_refinable_pivot,
     pseudo_inverse,
     quality_of,
     rank_of,
@@ -43,7 +43,7 @@ from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_
 from jaxdyn.systems.scene import Scene, as_scene, check_force
 
 # Steps of refinement near singular positions: the first one is made always, and each gains some four digits.
-_MOST_REFINEMENTS = 4
+_MAX_REFINEMENTS = 4
 
 METHODS = ("rank_aware", "schur")
 
@@ -180,7 +180,7 @@ def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
     lam, is_poor = _solve_with_refinement(normal, Y, deficit, quality, rank_tol)
     if Y.shape[1] == Y.shape[0] and not has_selection(scene):
         # Rows that leave no motion unless some repeat others: the fallback tells whether they do.
-        is_poor = is_poor | ~(quality > least_pivot(q, rank_tol))
+        is_poor = is_poor | ~(quality > min_pivot(q, rank_tol))
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
     # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a
     # mass matrix that is not positive definite.
@@ -263,10 +263,10 @@ def _solve_with_refinement(factor, Y, right, quality, rank_tol):
 
     # One step is enough for rows that are clearly independent. Near a singular position, where more are needed, a sample would
     # else leave the native loop, which takes as long as some hundred steps.
-    is_poor = ~(quality > least_pivot(right, rank_tol))
+    is_poor = ~(quality > min_pivot(right, rank_tol))
     first = refine((solve_cholesky(factor, right), is_poor))[0], is_poor
-    x, is_open = batch.repeat_while(lambda state: state[1], refine, first, _MOST_REFINEMENTS, marks=True)
-    return x, is_poor & (is_open | ~(quality > least_refinable_pivot(right, rank_tol)))
+    x, is_open = batch.repeat_while(lambda state: state[1], refine, first, _MAX_REFINEMENTS, marks=True)
+    return x, is_poor & (is_open | ~(quality > min_refinable_pivot(right, rank_tol)))
 
 
 def _by_schur(scene: Scene, q, v, tau, t) -> ConstrainedDynamics:

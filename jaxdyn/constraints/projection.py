@@ -14,9 +14,9 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.dynamics import whiten_rows
 from jaxdyn.constraints.rank import (
     LeastSquares,
-    least_pivot_of,
-    least_refinable_pivot,
     least_squares,
+    min_pivot_of,
+    min_refinable_pivot,
     pseudo_inverse,
     quality_of,
     regular_gram,
@@ -31,7 +31,7 @@ from jaxdyn.systems.system import displace, retract
 
 # Steps with one factorisation, and factorisations. Steps of an integrator drift by 1e-8 or less, where two steps with one factor
 # reach rounding. More rounds are needed after long steps and near singular positions, where A turns quickly.
-_STEPS_A_ROUND, _MOST_ROUNDS = 2, 3
+_STEPS_A_ROUND, _MAX_ROUNDS = 2, 3
 # A residual is a sum of many terms that cancel. Below this many rounding errors of the largest entry it is only rounding.
 ROUNDING_FACTOR = 64
 # Each step multiplies the residual by the size of the correction times the curvature of the constraints. A fixed number, because
@@ -84,10 +84,10 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 def _in_rounds(again: Callable, q, v, errors):
     """Rounds of a few steps, each with one factorisation of the rows.
 
-    Repeats again(q, v) -> (q, v, errors, are_poor, more) while `more`, once at least and `_MOST_ROUNDS` times at most.
+    Repeats again(q, v) -> (q, v, errors, are_poor, more) while `more`, once at least and `_MAX_ROUNDS` times at most.
     """
     start = q, v, errors, False, True
-    return batch.repeat_while(lambda state: state[4], lambda state: tuple(again(*state[:2])), start, _MOST_ROUNDS)[:4]
+    return batch.repeat_while(lambda state: state[4], lambda state: tuple(again(*state[:2])), start, _MAX_ROUNDS)[:4]
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
@@ -134,8 +134,8 @@ def _by_pivots(rank_tol, scene: Scene, q, v, t, errors):
         are_poor = jnp.zeros((), bool)
         if has_selection(scene):
             # Another choice may be independent where this one is nearly dependent (`renew_rows`).
-            *kept, least = rows_of(scene, Y.dtype)
-            are_poor = jnp.any(jnp.stack(kept) == 0) & ~(least_pivot_of(Y) > least)
+            *kept, minimum = rows_of(scene, Y.dtype)
+            are_poor = jnp.any(jnp.stack(kept) == 0) & ~(min_pivot_of(Y) > minimum)
         step = lambda residual: metric.unwhiten(matmul(Y, solve_cholesky(factor, residual)))  # noqa: E731
         return step, quality_of(factor), are_poor
 
@@ -146,8 +146,8 @@ def _by_pivots(rank_tol, scene: Scene, q, v, t, errors):
         quality, are_poor = jnp.minimum(quality, of_holonomic), are_poor | some_are_poor
     quality = jnp.where(metric.is_definite(), quality, jnp.nan)
     *state, more = _correct(scene, q, v, t, errors, every, some)
-    # Not `least_pivot`: the steps correct each other, so that a factor with few digits costs a step, not accuracy.
-    is_poor = ~(quality > least_refinable_pivot(q, rank_tol))
+    # Not `min_pivot`: the steps correct each other, so that a factor with few digits costs a step, not accuracy.
+    is_poor = ~(quality > min_refinable_pivot(q, rank_tol))
     return *jax.tree.map(lambda x: mark_invalid(is_poor, x), tuple(state)), are_poor, more
 
 

@@ -41,7 +41,7 @@ _MAX_OPERATIONS = 10_000
 _DOUBTFUL = 1e-3
 # Factor between the least singular value that counts and the largest that does not, or between distances of rows from the span of
 # the others, below which the numbers of a scene do not say what its rank is.
-LEAST_GAP = 100.0
+MIN_GAP = 100.0
 
 
 def check_tolerance(rank_tol: float | None) -> float | None:
@@ -61,14 +61,14 @@ def eps_of(like) -> float:
     return float(jnp.finfo(like.dtype).eps)
 
 
-def least_pivot(like, rank_tol: float | None) -> float:
+def min_pivot(like, rank_tol: float | None) -> float:
     """Ratio of the pivots of A M^-1 A^T above which rounding cannot make the rows dependent, so that Cholesky is accurate."""
     # Pivots are squares of singular values, hence the square. The factor of 100 keeps the fast path away from the threshold
     # itself: samples near it are computed by the one method that applies the threshold.
     return max(eps_of(like) ** REGULAR, (100 * tolerance(rank_tol, like)) ** 2)
 
 
-def least_refinable_pivot(like, rank_tol: float | None) -> float:
+def min_refinable_pivot(like, rank_tol: float | None) -> float:
     """Ratio of the pivots above which each step of refinement gains digits, and rounding cannot make the rows dependent."""
     # A step multiplies the error by some 2^-52 over this ratio, the square of the condition number: by 1e-4.
     return max(eps_of(like) ** REFINED, (100 * tolerance(rank_tol, like)) ** 2)
@@ -92,7 +92,7 @@ def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
     return gram + jnp.diag(jnp.where(squares == 0, fill, jnp.zeros_like(squares)))
 
 
-def least_pivot_of(Y: Float[Array, "n m"]) -> Float[Array, ""]:
+def min_pivot_of(Y: Float[Array, "n m"]) -> Float[Array, ""]:
     """Least pivot of Y^T Y over its diagonal entry, zero columns left out: 1 for orthogonal columns, 0 for dependent ones."""
     gram = regular_gram(Y)
     return jnp.min(jnp.diagonal(cholesky(gram)) ** 2 / jnp.diagonal(gram))
@@ -186,7 +186,7 @@ def _by_rotations(rank_tol, dependent, _, Y):
 
 
 def _by_pivots(rank_tol, dependent, _, Y):
-    return pseudo_inverse_by_pivots(Y, rank_tol, least_pivot(Y, rank_tol))
+    return pseudo_inverse_by_pivots(Y, rank_tol, min_pivot(Y, rank_tol))
 
 
 def _solve_normal_equations(rank_tol, dependent: bool, Y):
@@ -203,7 +203,7 @@ def _solve_normal_equations(rank_tol, dependent: bool, Y):
         inverse = solve_cholesky(factor, Y.T)
     # The normal equations square the condition number; one Newton-Schulz step restores the accuracy of an orthogonal method.
     inverse = 2 * inverse - matmul(matmul(inverse, Y), inverse)
-    return inverse, is_doubtful | ~(quality_of(factor) > least_pivot(Y, rank_tol))
+    return inverse, is_doubtful | ~(quality_of(factor) > min_pivot(Y, rank_tol))
 
 
 def _by_normal_equations(rank_tol, dependent: bool, _, Y):
@@ -255,7 +255,7 @@ def has_clear_rank(
 ) -> Bool[Array, ""]:
     """Decide whether the rank of rows A, with their pseudo-inverse, is clear; a constant.
 
-    The least singular value that counts has to be `LEAST_GAP` times the largest that does not. Rows that leave no motion have to
+    The least singular value that counts has to be `MIN_GAP` times the largest that does not. Rows that leave no motion have to
     be independent beyond doubt: a row that differs from a combination of others by the rounding of its numbers leaves none, too.
     Those of functions, not of bodies whose geometry may have been typed with few digits, are taken as they stand: `is_exact`.
     Kernels do not ask.
@@ -268,20 +268,20 @@ def _take_as_clear(rank_tol, is_exact: bool, _, A, inverse):
 
 
 def _has_gap(rank_tol, is_exact: bool, _, A, inverse):
-    (A, inverse), least = lax.stop_gradient((A, inverse)), tolerance(rank_tol, A)
+    (A, inverse), minimum = lax.stop_gradient((A, inverse)), tolerance(rank_tol, A)
     is_full = (rank_of(A, inverse) >= A.shape[1]) & (rank_tol is None and not is_exact and A.shape[0] >= A.shape[1])
 
     def compare():
         values = jnp.sqrt(gram_eigenvectors(A)[0])
-        counts = values > least * values[0]
+        counts = values > minimum * values[0]
         kept = jnp.min(jnp.where(counts, values, jnp.inf))
         squares = jnp.sum(A * A, 1, keepdims=True)
         unit = A / jnp.sqrt(jnp.where(squares > 0, squares, jnp.ones_like(squares)))
         is_sure = jnp.sqrt(gram_eigenvectors(unit)[0][-1]) > clear_pivot(A)
-        return (kept >= LEAST_GAP * jnp.max(jnp.where(counts, 0.0, values))) & (~is_full | is_sure)
+        return (kept >= MIN_GAP * jnp.max(jnp.where(counts, 0.0, values))) & (~is_full | is_sure)
 
     # 1 / |A^+| is below the least singular value that counts. No other one is above the tolerance.
-    sizes = LEAST_GAP * least * jnp.sqrt(jnp.sum(A * A)) * jnp.sqrt(jnp.sum(inverse * inverse))
+    sizes = MIN_GAP * minimum * jnp.sqrt(jnp.sum(A * A)) * jnp.sqrt(jnp.sum(inverse * inverse))
     # The second value is True where it counts, and varies along a mesh as the first one does.
     return batch.cond(is_full | ~(sizes <= 1), compare, lambda: sizes <= 1)
 

@@ -33,14 +33,14 @@ from jaxdyn.systems.system import displacement
 class KeptRows(eqx.Module):
     """The rows of a scene's constraints that count; the others are zero (`Scene.kept_rows`).
 
-    `kept` (nc,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`. `is_held`:
+    `kept` (nc,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `minimum` and `gap` () as in `Selection`. `is_held`:
     whether the choice is the user's (`choose_rows`), which every function checks and renews.
     """
 
     # Arrays, not static: another choice of rows in the course of a motion runs the same program.
     kept: Float[Array | np.ndarray, " nc"]
     rounding: Float[Array | np.ndarray, ""]
-    least: Float[Array | np.ndarray, ""]
+    minimum: Float[Array | np.ndarray, ""]
     gap: Float[Array | np.ndarray, ""]
     is_held: bool = eqx.field(static=True, default=False)
 
@@ -49,22 +49,22 @@ class Selection(NamedTuple):
     """The independent rows of a mechanism: `kept` (nc,), 1 or 0.
 
     `rounding` (): the part of their size by which the dropped rows are open, or differ from combinations of the kept ones.
-    `least` (): the least pivot of the kept rows, in the metric of the mass matrix, below which they are chosen anew.
+    `minimum` (): the least pivot of the kept rows, in the metric of the mass matrix, below which they are chosen anew.
     `gap` (): least distance of a kept row from the others over the largest of a dropped one, where they were told apart, and
     `gap_here` () at the configuration.
     """
 
     kept: Float[Array, " nc"]
     rounding: Float[Array, ""]
-    least: Float[Array, ""]
+    minimum: Float[Array, ""]
     gap: Float[Array, ""]
     gap_here: Float[Array, ""]
 
 
 def keep_rows(scene: Scene, selection: Selection, *, is_held: bool = False) -> Scene:
     """The scene with the rows that are not kept set to zero."""
-    kept, rounding, least, gap, _ = map(jnp.asarray, selection)
-    return scene.with_kept_rows(KeptRows(kept, rounding, least, gap, is_held))
+    kept, rounding, minimum, gap, _ = map(jnp.asarray, selection)
+    return scene.with_kept_rows(KeptRows(kept, rounding, minimum, gap, is_held))
 
 
 def add_constraints(scene: Scene, more: Sequence[Constraint], forces: Sequence[Any] = ()) -> Scene:
@@ -100,8 +100,8 @@ def all_rows(scene: Scene) -> Scene:
 
 
 def rows_of(scene: Scene, dtype) -> Float[Array, " n"]:
-    """The choice of rows as the vector that a step carries: 1 or 0 for each row, then `Selection.least`; a constant."""
-    return lax.stop_gradient(jnp.append(scene.kept_rows.kept, scene.kept_rows.least)).astype(dtype)
+    """The choice of rows as the vector that a step carries: 1 or 0 for each row, then `Selection.minimum`; a constant."""
+    return lax.stop_gradient(jnp.append(scene.kept_rows.kept, scene.kept_rows.minimum)).astype(dtype)
 
 
 # A row below this part of the largest one of its constraint has no direction of its own: rounding is all that it holds.
@@ -120,16 +120,16 @@ def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     return A * (1.0 / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny))))[:, None]
 
 
-def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
+def eliminate(B: Float[Array, "nc nv"], minimum: float, first: Float[Array, " nc"], maximum=None) -> tuple[Array, ...]:
     """Independent rows of B by Gram-Schmidt with pivots.
 
     The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
-    others; a row is kept where its pivot is above `least`, and `most` rows at most.
+    others; a row is kept where its pivot is above `minimum`, and `maximum` rows at most.
 
     **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of the others.
     """
     # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
-    kept, rest, pivots = eliminate_rows(B, first, least, min(B.shape) if most is None else most)
+    kept, rest, pivots = eliminate_rows(B, first, minimum, min(B.shape) if maximum is None else maximum)
     return kept, jnp.max(rest), jnp.min(jnp.where(kept > 0, pivots, jnp.inf))
 
 
@@ -209,7 +209,7 @@ def largest_of_each(scene: Scene, sizes) -> Array:
     return jnp.concatenate([jnp.full_like(part, jnp.max(part)) for part in parts])
 
 
-def most_opening(scene: Scene, dtype):
+def max_opening(scene: Scene, dtype):
     """Largest opening of dropped rows along a motion: a hundred times their opening or difference at its start, plus rounding."""
     # A hundred times, because the rounding of a file can cancel at the start: at the configuration in which it was written.
     return 100 * scene.kept_rows.rounding + eps_of(jnp.zeros((), dtype)) ** REGULAR
@@ -224,7 +224,7 @@ def most_opening(scene: Scene, dtype):
 
 # Rows vanish at singular positions. A row below this part of a usual one is compared with the usual one, else any residual of
 # rounding would count as open there.
-_LEAST_ROW = 1e-3
+_MIN_ROW = 1e-3
 # Rounding errors, of eps times the length, that a residual may hold: it is a difference of sums along two chains of bodies.
 _ROUNDING = 32
 
@@ -272,7 +272,7 @@ def row_limits(scene: Scene, q, v, t, relative: float) -> tuple[Float[Array, " n
     sizes, length = coordinate_sizes(scene.system, q.dtype)
     A = constraint_jacobian(scene, q, t)
     rows = jnp.max(jnp.abs(A) * sizes[None], axis=1)
-    rows = jnp.maximum(rows, _LEAST_ROW * jnp.minimum(length, jnp.ones_like(length)))
+    rows = jnp.maximum(rows, _MIN_ROW * jnp.minimum(length, jnp.ones_like(length)))
     rounding = _ROUNDING * float(jnp.finfo(q.dtype).eps) * jnp.maximum(length, jnp.ones_like(length))
     limits = relative * rows + rounding
     # The rate of a residual carries the rounding of the velocities, however fast they are.

@@ -27,14 +27,14 @@ from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.rank import (
-    LEAST_GAP,
+    MIN_GAP,
     REGULAR,
     RESIDUAL,
     check_tolerance,
     clear_pivot,
     eps_of,
     has_clear_rank,
-    least_pivot_of,
+    min_pivot_of,
     pseudo_inverse,
     rank_of,
     solve_with_damping,
@@ -67,7 +67,7 @@ _FAR, _NEWTON_STEPS = 0.2, 12
 _EXCHANGED_AT = 0.25
 UNCLEAR_RANK = (
     "the rank of the constraints is not clear at this q: singular values that count differ by less than a factor of "
-    f"{LEAST_GAP:g} from those that do not"
+    f"{MIN_GAP:g} from those that do not"
 )
 
 
@@ -112,7 +112,7 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
     if is_concrete(selection):
         if np.all(np.asarray(selection.kept) == 1):
             return scene
-        if not min(selection.gap, selection.gap_here) >= LEAST_GAP:
+        if not min(selection.gap, selection.gap_here) >= MIN_GAP:
             raise ValueError(
                 f"q: {UNCLEAR_RANK}; give numbers with more digits, or an assembled q away from singular positions"
             )
@@ -133,14 +133,14 @@ def _held_selection(scene: Scene, q, t) -> Selection:
 
 def hide_unclear(selection: Selection) -> Selection:
     """The selection with NaN for all rows where it is not clear which ones are independent, so that no result is a guess."""
-    return selection._replace(kept=jnp.where(selection.gap >= LEAST_GAP, selection.kept, jnp.nan))
+    return selection._replace(kept=jnp.where(selection.gap >= MIN_GAP, selection.kept, jnp.nan))
 
 
 def rank_code(scene: Scene, result: Any) -> Any:
     """The result, or `unclear_rank` where kept and dropped rows of a scene of `independent_rows` differ too little."""
     if not has_selection(scene):
         return result
-    is_clear = scene.kept_rows.gap >= LEAST_GAP
+    is_clear = scene.kept_rows.gap >= MIN_GAP
     return RESULTS.where(is_clear, result, RESULTS.unclear_rank)
 
 
@@ -174,16 +174,14 @@ def select_rows(scene: Scene, q, t: Numbers, rank_tol: float | None = None) -> S
 def rows_and_doubts(scene: Scene, *, rank_tol: float | None, dtype) -> tuple[Selection, Evaluation]:
     """All rows of a known scene, and whether some are doubtful at (q, t)."""
     bare, every = scene.without_forces, _every_row(scene, dtype)
-    return every, Evaluation(
-        _has_doubtful_rows, bare, (_least_doubtless(every.kept, rank_tol),), is_input=is_given(bare)
-    )
+    return every, Evaluation(_has_doubtful_rows, bare, (_min_doubtless(every.kept, rank_tol),), is_input=is_given(bare))
 
 
 @kernel(static=1, fallback=lambda rank_tol, scene, q, t: _select(scene, q, t, rank_tol))
 def _select_in_kernel(rank_tol: float | None, scene: Scene, q, t) -> Selection:
     """All rows; invalid where some may repeat others, whose choice takes more than a kernel should hold."""
     kept, *rest = map(jnp.asarray, _every_row(scene, q.dtype))
-    is_doubtful = _has_doubtful_rows(_least_doubtless(q, rank_tol), scene, q, t)
+    is_doubtful = _has_doubtful_rows(_min_doubtless(q, rank_tol), scene, q, t)
     return Selection(mark_invalid(is_doubtful, kept), *rest)
 
 
@@ -203,16 +201,16 @@ def _select(scene: Scene, q, t, rank_tol) -> Selection:
         kept, rest, far = _select_far_away(scene, q, t, sure, apart)
         has_more = jnp.any(kept > sure)
         pivot = jnp.where(has_more, far, jnp.maximum(far, pivot))
-        here, _, least_here = eliminate(kept[:, None] * B, 0.0, sure)
+        here, _, min_here = eliminate(kept[:, None] * B, 0.0, sure)
         # A row that vanishes here, as in a singular position, has a pivot of zero.
-        least_here = jnp.where(jnp.sum(here) < jnp.sum(kept), jnp.zeros_like(least_here), least_here)
-        pivot_here = jnp.where(has_more, least_here, pivot_here)
+        min_here = jnp.where(jnp.sum(here) < jnp.sum(kept), jnp.zeros_like(min_here), min_here)
+        pivot_here = jnp.where(has_more, min_here, pivot_here)
     rounding = jnp.maximum(rest, kernel(largest_opening)(scene, q, t, kept))
     # A gap to nothing is one to the rounding of the numbers: where no row is dropped, those in doubt may be dependent here.
     below = jnp.maximum(rest, eps_of(q))
     below_here = jnp.where(jnp.all(kept == 1), jnp.maximum(below, scene.rounding), jnp.maximum(below, rounding))
-    least = _EXCHANGED_AT * kernel(_pivot_of)(scene, q, t, kept)
-    chosen = Selection(kept, rounding, least, pivot / below, pivot_here / below_here)
+    minimum = _EXCHANGED_AT * kernel(_pivot_of)(scene, q, t, kept)
+    chosen = Selection(kept, rounding, minimum, pivot / below, pivot_here / below_here)
     every, is_finite = _every_row(scene, q.dtype), jnp.isfinite(B).all()
     return jax.tree.map(lambda x, y: jnp.where(is_finite, x, y), chosen, every)
 
@@ -234,15 +232,15 @@ def are_rows_poor(scene: Scene, q, t) -> Bool[Array, ""]:
 
 
 def _are_poor(bare: Scene, q, t, rows):
-    kept, least = rows[:-1], rows[-1]
-    return jnp.any(kept == 0) & ~(_pivot_of(bare, q, t, kept) > least)
+    kept, minimum = rows[:-1], rows[-1]
+    return jnp.any(kept == 0) & ~(_pivot_of(bare, q, t, kept) > minimum)
 
 
 def _choose_again(bare: Scene, q, t, old):
     """Another choice of rows where the old one is poor."""
-    kept, least = old[:-1], old[-1]
+    kept, minimum = old[:-1], old[-1]
     pivot = kernel(_pivot_of)(bare, q, t, kept)
-    is_poor = jnp.any(kept == 0) & ~(pivot > least)
+    is_poor = jnp.any(kept == 0) & ~(pivot > minimum)
     # The number of rows is kept: only the count at the start distinguishes redundant rows from a singular position.
     new = eliminate(kernel(unit_rows)(bare, q, t), 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
     pivot_of_new = kernel(_pivot_of)(bare, q, t, new)
@@ -259,23 +257,23 @@ def _renew(bare: Scene, q, t, old):
 
 
 def _pivot_of(scene: Scene, q, t, kept):
-    """`least_pivot_of` the kept rows in the metric of the mass matrix; zero where one of them vanishes."""
+    """`min_pivot_of` the kept rows in the metric of the mass matrix; zero where one of them vanishes."""
     A = kept[:, None] * constraint_jacobian(scene, q, t)
     Y = mass_factor(mass_matrix(scene.system, q, t)).whiten(A.T)
     vanishes = jnp.any((kept > 0) & (jnp.sum(Y * Y, 0) == 0))
-    return jnp.where(vanishes, 0.0, least_pivot_of(Y))
+    return jnp.where(vanishes, 0.0, min_pivot_of(Y))
 
 
-def _least_doubtless(like, rank_tol: float | None) -> float:
+def _min_doubtless(like, rank_tol: float | None) -> float:
     """Distance from the others above which a row counts, whatever the tolerance."""
     return max(clear_pivot(like), rank_tol or 0.0)
 
 
-def _has_doubtful_rows(least: float, scene: Scene, q, t):
-    """Decide whether the distance of some row from the span of those before it is not above `least`; True for NaN."""
+def _has_doubtful_rows(minimum: float, scene: Scene, q, t):
+    """Decide whether the distance of some row from the span of those before it is not above `minimum`; True for NaN."""
     # The diagonal of the Cholesky factor of B B^T holds these distances, NaN where a row is dependent.
     B = unit_rows(scene, q, t)
-    return ~(jnp.min(jnp.diagonal(cholesky(matmul(B, B.T)))) > least)
+    return ~(jnp.min(jnp.diagonal(cholesky(matmul(B, B.T)))) > minimum)
 
 
 def _select_far_away(scene: Scene, q, t, sure, apart: float):
@@ -285,7 +283,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
     where it holds at q and at least one degree of freedom is left.
     """
     sizes, _ = coordinate_sizes(scene.system, q.dtype)
-    least = tolerance(None, q)
+    minimum = tolerance(None, q)
     held = holonomic_rows(layout(scene))
 
     # Any admissible direction will do that moves all of the mechanism. The golden ratio's multiples are equally spread, and the
@@ -326,13 +324,13 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
         return kept, rest, pivot
     # Exact numbers: what is left of a row is its true direction, unless the row contradicts the others, or would leave no motion
     # at all. In both cases the difference is rounding in the numbers of the scene after all.
-    every, least_rest, least_pivot = eliminate(B, least, kept)
+    every, min_rest, min_pivot = eliminate(B, minimum, kept)
     met = largest_opening(scene, q, t, 1 - every * (1 - kept)) <= eps_of(q) ** REGULAR
     counts = met & (jnp.sum(every) < scene.nv)
-    return tuple(jnp.where(counts, x, y) for x, y in ((every, kept), (least_rest, rest), (least_pivot, pivot)))
+    return tuple(jnp.where(counts, x, y) for x, y in ((every, kept), (min_rest, rest), (min_pivot, pivot)))
 
 
-def most_rounding(dtype) -> float:
+def max_rounding(dtype) -> float:
     """Opening of dropped rows above which they are not redundant but contradict the others."""
     return 10 * clear_pivot(np.zeros((), dtype))
 
@@ -383,5 +381,5 @@ def count_free(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
     inverse = pseudo_inverse(A, tolerance(rank_tol, A), True)
     is_clear = has_clear_rank(A, inverse, rank_tol)
     if has_selection(scene):
-        is_clear = is_clear & (scene.kept_rows.gap >= LEAST_GAP)
+        is_clear = is_clear & (scene.kept_rows.gap >= MIN_GAP)
     return jnp.where(is_clear, scene.nv - rank_of(A, inverse), -1).astype(jnp.int32)

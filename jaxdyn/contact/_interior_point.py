@@ -30,7 +30,7 @@ from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 REFINEMENTS = 4
 # Share of mu below which the square of the least eigenvalue of the scaled point counts as off the central path, and the centring
 # then. In 600 programs near the apex all converge, in one or two steps more; in as many others no step changes.
-_OFF_CENTRE, _LEAST_CENTRING = 1e-2, 0.1
+_OFF_CENTRE, _MIN_CENTRING = 1e-2, 0.1
 Pattern = tuple[bytes | None, ...]  # for each group, the mask of entries of G that may be nonzero; None for all
 
 
@@ -111,10 +111,10 @@ def _start(pattern: Pattern, _, program: Program):
     slack = map_groups(lambda a, b: b - a, rows_times(G, x), h)
 
     def inside(groups):
-        least = jnp.min(jnp.stack([jnp.min(jordan.boundary_distance(v), initial=jnp.inf) for v in groups]))
+        minimum = jnp.min(jnp.stack([jnp.min(jordan.boundary_distance(v), initial=jnp.inf) for v in groups]))
         size = jnp.maximum(largest(groups), 1)
         # Far enough from the boundary that the first steps are not cut short.
-        shift = jnp.where(least > 0.1 * size, 0, jnp.maximum(-least, 0) + size)
+        shift = jnp.where(minimum > 0.1 * size, 0, jnp.maximum(-minimum, 0) + size)
         return map_groups(lambda v: v + shift * jordan.identity(v), groups)
 
     # In the least-squares problem above the multipliers are z = G x - h, minus the slacks.
@@ -167,8 +167,8 @@ def _step(program: Program, point: Point, residuals) -> Point:
     *_, wds, wdz = solve(rx, rz, map_groups(lambda v: -v, lam), is_refined=False)
     # Mehrotra's heuristic: centre little where the affine step is long. Near the apex of a cone one eigenvalue of lam may run to
     # zero ahead of the others, a hundredth a step, until rounding ends the iteration: there some centring is kept.
-    least = jnp.min(jnp.stack([jnp.min(jordan.boundary_distance(v)) for v in lam]))
-    floor = jnp.where(least * least < _OFF_CENTRE * mu, _LEAST_CENTRING, 0.0).astype(mu.dtype)
+    minimum = jnp.min(jnp.stack([jnp.min(jordan.boundary_distance(v)) for v in lam]))
+    floor = jnp.where(minimum * minimum < _OFF_CENTRE * mu, _MIN_CENTRING, 0.0).astype(mu.dtype)
     centring = jnp.maximum((1 - 1 / jnp.maximum(inverse_step(wds, wdz), 1)) ** 3, floor)
     # Linearised complementarity with the second-order term (W^-1 ds) o (W dz) of the predictor.
     u = map_groups(
@@ -265,9 +265,9 @@ def _refinement(pattern: Pattern, _, program: Program, state: _Refined) -> _Refi
     there, *_, less = at(x + dx, map_groups(lambda a, b: a + b, v, dv))
     # A NaN residual compares false, so that it is rejected.
     is_here = ~(less < residual)
-    new, least = _where(is_here, here, there), jnp.where(is_here, residual, less)
-    better = (least < state.error) & going
-    best, error = _where(better, (new, least), (state.best, state.error))
+    new, minimum = _where(is_here, here, there), jnp.where(is_here, residual, less)
+    better = (minimum < state.error) & going
+    best, error = _where(better, (new, minimum), (state.best, state.error))
     # At rounding there is nothing to be gained by another attempt.
     spent = jnp.where(error > 1e3 * eps, 1, 2).astype(state.credit.dtype)
     credit = jnp.where(better, jnp.full_like(state.credit, 2), state.credit - spent)

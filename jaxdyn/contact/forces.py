@@ -206,7 +206,7 @@ def _pad_rows(rows: Float[Array, "..."], sides) -> Float[Array, "..."]:
 _FIRST_FACES = 8
 _ROUNDS = 60
 _TIGHT = 1e-9  # distance of the bounds at which the cutting-plane iteration ends
-_LEAST = 1e-8  # relative to the largest; margins and singular values below are zero
+_MINIMUM = 1e-8  # relative to the largest; margins and singular values below are zero
 
 
 class ForceClosure(eqx.Module):
@@ -288,7 +288,7 @@ def force_closure_of_map(
     unit = np.where(sizes[:, None] > 0, G[:, rows.kept], 0.0) / np.where(sizes > 0, sizes, 1)[:, None]
     # The full left factor: without full row rank its last column is orthogonal to the range of G.
     left, singular, _ = np.linalg.svd(unit)
-    rank = int(np.sum(singular > _LEAST * singular[0])) if singular.size and singular[0] > 0 else 0
+    rank = int(np.sum(singular > _MINIMUM * singular[0])) if singular.size and singular[0] > 0 else 0
     nothing, none = np.zeros(G.shape[1]), np.zeros(G.shape[0])
     # Without full row rank the last left singular vector is a wrench outside the range of G.
     if rank < G.shape[0]:
@@ -296,7 +296,7 @@ def force_closure_of_map(
     if not len(rows.linear) and not len(rows.second):
         return ForceClosure(True, float("inf"), nothing, none, rank)
     margin, forces, twist = _largest_margin(unit, rows)
-    if margin <= _LEAST:
+    if margin <= _MINIMUM:
         return ForceClosure(False, 0.0, nothing, _wrench(twist, sizes), rank)
     nothing[rows.kept] = forces
     return ForceClosure(True, margin, nothing, none, rank)
@@ -395,7 +395,7 @@ def _largest_margin(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
         friction = np.linalg.norm(seen[:, 1:], axis=1)
         margins = np.concatenate([-rows.linear @ forces, seen[:, 0] - friction])
         # Faces are outside the cones, so t is an upper bound; the margin of its forces is a lower one.
-        if upper <= _LEAST or margins.min() >= upper - _TIGHT:
+        if upper <= _MINIMUM or margins.min() >= upper - _TIGHT:
             break
         # Tangent planes of the round cones at the current forces cut off the current solution.
         touching = [(s, y / n) for s, y, n in zip(rows.second, seen[:, 1:], friction, strict=True) if n > 0]
@@ -403,7 +403,7 @@ def _largest_margin(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
     else:
         raise RuntimeError(f"force closure: the margin was not found to {_TIGHT} with {_ROUNDS} rounds of faces")
     return (
-        float(min(margins.min(), upper)) if upper > _LEAST else float(upper),
+        float(min(margins.min(), upper)) if upper > _MINIMUM else float(upper),
         forces,
         # Marginals are derivatives of the cost -t with respect to the right-hand side, hence the sign.
         -solution.eqlin.marginals[: len(G)],

@@ -150,10 +150,10 @@ def _pattern(rows, A) -> bytes | None:
 def _check_definite(Q):
     if is_concrete(Q):
         known = np.asarray(Q, float)
-        least = np.linalg.eigvalsh((known + known.T) / 2)[0]
-        if not least > 0:
+        minimum = np.linalg.eigvalsh((known + known.T) / 2)[0]
+        if not minimum > 0:
             raise ValueError(
-                f"Q is not positive definite, its smallest eigenvalue is {least}; add a small multiple of the identity"
+                f"Q is not positive definite, its smallest eigenvalue is {minimum}; add a small multiple of the identity"
             )
 
 
@@ -317,7 +317,7 @@ class _State(NamedTuple):
     x: Array
     free: Array
     at_minimum: Array  # whether x is the minimum over the free coordinates
-    least: Array  # the value at the last such minimum
+    minimum: Array  # the value at the last such minimum
     futile: Array  # coordinates whose release did not reduce the value
     released: Array  # the coordinate released last
     goes_on: Array
@@ -329,7 +329,7 @@ def minimize_in_box(H: Float[Array, "n n"], g: Float[Array, " n"], lower: Array,
     n = g.shape[0]
     diagonal = jnp.diagonal(H)
     # In practice 2 n steps or less. The bound only ends programs without a minimum.
-    most = 100 + 20 * n
+    maximum = 100 + 20 * n
 
     def gradient(x):
         """The gradient, and the size of the terms that cancel in it, so that tolerances do not depend on units."""
@@ -357,13 +357,13 @@ def minimize_in_box(H: Float[Array, "n n"], g: Float[Array, " n"], lower: Array,
         return step - solve_cholesky(factor, jnp.where(free, rest, jnp.zeros_like(rest)))
 
     def improve(state: _State):
-        x, free, at_minimum, least, futile, released, _, count = state
+        x, free, at_minimum, minimum, futile, released, _, count = state
         slope, size = gradient(x)
         here = value(x)
         # Pulls close to rounding may be wrong: a release that does not reduce the value is not repeated until another one does.
-        falls = here < least
+        falls = here < minimum
         futile = jnp.where(at_minimum, (futile | released) & ~falls, futile)
-        least = jnp.where(at_minimum, jnp.minimum(here, least), least)
+        minimum = jnp.where(at_minimum, jnp.minimum(here, minimum), minimum)
         pulls = pull(x, free, slope)
         pulls = jnp.where(futile | (pulls <= 4 * eps_of(x) * size), jnp.zeros_like(pulls), pulls)
         # The largest reduction that a coordinate alone would bring.
@@ -387,7 +387,7 @@ def minimize_in_box(H: Float[Array, "n n"], g: Float[Array, " n"], lower: Array,
             y,
             free & ~bounded,
             is_whole,
-            least,
+            minimum,
             futile,
             jnp.where(at_minimum, release, released),
             # The Cholesky factor of an indefinite H is NaN.
@@ -407,7 +407,7 @@ def minimize_in_box(H: Float[Array, "n n"], g: Float[Array, " n"], lower: Array,
     begin = _State(
         start, free, jnp.asarray(False), jnp.full((), jnp.inf, g.dtype), none, none, jnp.asarray(True), jnp.asarray(0)
     )
-    x, free, *_ = lax.while_loop(lambda state: state.goes_on & (state.count < most), improve, begin)
+    x, free, *_ = lax.while_loop(lambda state: state.goes_on & (state.count < maximum), improve, begin)
     slope, size = gradient(x)
     left = jnp.where(free, jnp.abs(slope), pull(x, free, slope))
     is_optimal = jnp.all(left <= _ROUNDING * eps_of(x) * size) & jnp.all((x >= lower) & (x <= upper))

@@ -231,8 +231,8 @@ def _leaf(value, like: Array) -> Array:
 _DIRECTIONS = 400  # in which the error of a hull is measured
 
 
-def hull_vertices(points: np.ndarray, most: int) -> tuple[np.ndarray, int, float]:
-    """At most `most` vertices (n, 3) of the convex hull of points, the number of all, and the largest distance left out, m.
+def hull_vertices(points: np.ndarray, maximum: int) -> tuple[np.ndarray, int, float]:
+    """At most `maximum` vertices (n, 3) of the convex hull of points, the number of all, and the largest distance left out, m.
 
     Vertices are added where the hull so far falls most short, in directions that are spread over the sphere.
     """
@@ -245,14 +245,14 @@ def hull_vertices(points: np.ndarray, most: int) -> tuple[np.ndarray, int, float
         points = points[np.sort(Hull(points).vertices)]
     except (QhullError, ValueError):
         pass  # flat, or less than four points: all of them
-    if len(points) <= most:
+    if len(points) <= maximum:
         return points, len(points), 0.0
     k = np.arange(_DIRECTIONS) + 0.5
     polar, around = np.arccos(1 - 2 * k / _DIRECTIONS), np.pi * (1 + 5**0.5) * k
     directions = np.stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], 1)
     reach = points @ directions.T
     wanted, chosen = reach.max(0), [int(np.argmax(reach[:, 0]))]
-    while len(chosen) < most:
+    while len(chosen) < maximum:
         short = wanted - reach[chosen].max(0)
         if short.max() <= 0:
             break

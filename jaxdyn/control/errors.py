@@ -51,8 +51,8 @@ def gain(value: Any, name: str) -> Array:
         # Only the symmetric part enters e . K e, so it alone decides definiteness.
         known = np.asarray(array, float)
         # `initial` admits a gain for no rows, which has no least entry.
-        least = np.linalg.eigvalsh((known + known.T) / 2).min() if known.ndim == 2 else known.min(initial=np.inf)
-        if not (np.isfinite(known).all() and least > 0):
+        minimum = np.linalg.eigvalsh((known + known.T) / 2).min() if known.ndim == 2 else known.min(initial=np.inf)
+        if not (np.isfinite(known).all() and minimum > 0):
             raise ValueError(f"{name} is {known.tolist()}, which is not positive definite; give positive gains")
     # Integer gains become floating-point leaves: `jax.grad` refuses integers.
     return as_float(array, name)
@@ -246,12 +246,12 @@ def regularity(system, q, t, A, T, passive: Sequence[int] = ()) -> Float[Array, 
     Y, Z = metric.whiten(A.T), metric.whiten(T.T)
     fixed = matmul(Y, pseudo_inverse(Y, tolerance(None, Y)))
     # What remains of a row without the span of the constraints measures its independence of them.
-    least = _squared_sines(Z - matmul(fixed, Z), Z)
+    minimum = _squared_sines(Z - matmul(fixed, Z), Z)
     if len(passive):
         # U^T v = U^-1 M v has the length of the velocity v in the metric M.
         idle = metric.whiten(M[:, np.array(passive, int)])
-        least += _squared_sines(matmul(fixed, idle), idle)
-    return safe_sqrt(jnp.min(jnp.stack(least)))
+        minimum += _squared_sines(matmul(fixed, idle), idle)
+    return safe_sqrt(jnp.min(jnp.stack(minimum)))
 
 
 def _squared_sines(left: Float[Array, "n m"], whole: Float[Array, "n m"]) -> list[Float[Array, ""]]:

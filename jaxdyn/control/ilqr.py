@@ -45,9 +45,9 @@ from jaxdyn.systems.scene import as_pytree
 
 # Eleven lengths from 1 to 1e-3. They and the schedule of mu are those of the program iLQG of Tassa, Erez & Todorov (2012).
 _LENGTHS = tuple(10.0 ** (-3 * i / 10) for i in range(11))
-_LEAST_PART = 1e-4  # of the reduction that the expansion predicts
+_MIN_PART = 1e-4  # of the reduction that the expansion predicts
 _LARGEST_PART = 1e2  # of `tol`, that a step may predict which brings less than `tol`
-_FACTOR, _LEAST_DAMPING, _LARGEST_DAMPING = 1.6, 1e-6, 1e10
+_FACTOR, _MIN_DAMPING, _LARGEST_DAMPING = 1.6, 1e-6, 1e10
 _RUNNING, _CONVERGED, _NO_DESCENT, _NOT_FINITE = range(4)
 
 
@@ -268,7 +268,7 @@ def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
         _, count = carry
         alpha = jnp.asarray(_LENGTHS, k.dtype)[count]
         xs, us, cost = _rollout(problem, state.xs[0], state.xs[:-1], state.us, alpha * k, K)
-        enough = state.cost - cost >= -_LEAST_PART * alpha * (gradient + alpha * curvature)
+        enough = state.cost - cost >= -_MIN_PART * alpha * (gradient + alpha * curvature)
         # A cost of NaN compares false, so that the next length is tried.
         return (xs, us, cost, enough & (cost < state.cost)), count + 1
 
@@ -285,8 +285,8 @@ def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
         falls, jnp.minimum(state.factor / _FACTOR, 1 / _FACTOR), jnp.maximum(state.factor * _FACTOR, _FACTOR)
     )
     # Below its least value mu is exactly zero, so that steps close to the minimum are undamped.
-    less = jnp.where(state.damping * ratio > _LEAST_DAMPING, state.damping * ratio, jnp.zeros_like(ratio))
-    damping = jnp.where(falls, less, jnp.maximum(state.damping * ratio, _LEAST_DAMPING))
+    less = jnp.where(state.damping * ratio > _MIN_DAMPING, state.damping * ratio, jnp.zeros_like(ratio))
+    damping = jnp.where(falls, less, jnp.maximum(state.damping * ratio, _MIN_DAMPING))
     # A small reduction is a sign of a minimum only if it is that of a full step, little damped, from which little was expected.
     is_full = (count == 1) & is_damped_little & (predicted <= _LARGEST_PART * tol * size)
     converged = is_small | (falls & is_full & (state.cost - cost <= tol * size))

@@ -32,7 +32,7 @@ from jaxdyn.constraints.redundancy import (
     opening_of_redundant,
     unit_size_rows,
 )
-from jaxdyn.constraints.selection import independent_rows, most_rounding
+from jaxdyn.constraints.selection import independent_rows, max_rounding
 from jaxdyn.control.targets import (
     TASKS,
     Aims,
@@ -216,7 +216,7 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
         opening = jnp.maximum(opening, jnp.max(jnp.abs(position_residual(every, q, t))))
     # Evaluated again, because sliding towards the posture has changed q.
     reached = reaches_targets(fixed, lax.stop_gradient(q), time, aims)
-    reached = reached & (opening_of_redundant(scene, q, t) <= most_rounding(q.dtype))
+    reached = reached & (opening_of_redundant(scene, q, t) <= max_rounding(q.dtype))
     closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)
     result = RESULTS.where(reached, RESULTS.where(is_nearest, RESULTS.successful, RESULTS.not_nearest), result)

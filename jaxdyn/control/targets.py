@@ -221,7 +221,7 @@ _STEPS, _LAST_STEPS = 40, 100
 _DAMPING, _LESS, _MORE = 1e-2, 0.2, 6.0
 _LARGEST_STEP = 1.0  # rad or lengths of the mechanism
 # A search ends where a step reduces the squared errors by a smaller part than this; the last one continues longer.
-_LEAST_GAIN, _LEAST_LAST_GAIN = 1e-2, 1e-9
+_MIN_GAIN, _MIN_LAST_GAIN = 1e-2, 1e-9
 
 
 class Aims(NamedTuple):
@@ -258,9 +258,9 @@ def aims_of(whole: Scene, constraints: int, factors, limits: bool, atol) -> Aims
     count = nh - is_length.size
     weights = jnp.concatenate([jnp.ones((count,), dtype), factors * scale])
     near = closing_tolerance(dtype) if atol is None else atol
-    least = near * (jnp.maximum(length, 1.0) if atol is None else jnp.ones_like(length))
+    minimum = near * (jnp.maximum(length, 1.0) if atol is None else jnp.ones_like(length))
     # Tolerances have the weights of their rows: a weight of zero gives a row and a tolerance of zero, which counts as reached.
-    tolerances = jnp.concatenate([jnp.broadcast_to(least, (count,)), least * factors * scale])
+    tolerances = jnp.concatenate([jnp.broadcast_to(minimum, (count,)), minimum * factors * scale])
     exact = jnp.asarray(np.arange(nh) < count, dtype)
     endless = jnp.full_like(model.lower, jnp.inf)
     lower, upper = (model.lower, model.upper) if limits else (-endless, endless)
@@ -281,7 +281,7 @@ class SearchState(NamedTuple):
     steps: Array
     tried: Array
     best: Array
-    least: Array
+    minimum: Array
     guess: Array
     done: Array
 
@@ -313,13 +313,13 @@ def _step(guesses: int, scene: Scene, constants, state: SearchState, _) -> Itera
     falls = new < errors
     q, after = jnp.where(falls, tried, q), jnp.where(falls, new, errors)
     damping = jnp.clip(jnp.where(falls, _LESS * damping, _MORE * damping), 1e-8, 1e8)
-    is_better = after < state.least
-    best, least = jnp.where(is_better, q, state.best), jnp.where(is_better, after, state.least)
+    is_better = after < state.minimum
+    best, minimum = jnp.where(is_better, q, state.best), jnp.where(is_better, after, state.minimum)
 
     # Rows that are there already count as such, whatever their weights.
     reached = jnp.all(jnp.where(falls, jnp.abs(left) <= aims.tolerances, jnp.abs(r) <= aims.tolerances))
     is_last = state.tried >= guesses
-    gain = jnp.where(is_last, _LEAST_LAST_GAIN, _LEAST_GAIN).astype(q.dtype)
+    gain = jnp.where(is_last, _MIN_LAST_GAIN, _MIN_GAIN).astype(q.dtype)
     stops = (falls & (new > (1 - gain) * errors)) | (damping >= 1e6)
     stops = stops | (state.steps >= jnp.where(is_last, _LAST_STEPS, _STEPS)) | ~jnp.isfinite(new)
     elsewhere = stops & ~is_last & ~reached
@@ -333,7 +333,7 @@ def _step(guesses: int, scene: Scene, constants, state: SearchState, _) -> Itera
         jnp.where(elsewhere, jnp.zeros_like(state.steps), state.steps + 1),
         tried_next,
         best,
-        least,
+        minimum,
         state.guess,
         done,
     )

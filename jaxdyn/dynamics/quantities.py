@@ -232,8 +232,8 @@ def _by_recursions(model: Model, forms: Mapping, fallback: Callable) -> Callable
 
     is_written_out = model.nb <= tree_frames.MAX_BODIES
     # Robots with floating bases have most axes at right angles.
-    least = tree_frames.MAX_BODIES + 1 if sweeps.has_base(model) else tree_frames.MIN_BODIES_IN_SWEEPS
-    if model.nb < least or not sweeps.has_sweeps(model):
+    minimum = tree_frames.MAX_BODIES + 1 if sweeps.has_base(model) else tree_frames.MIN_BODIES_IN_SWEEPS
+    if model.nb < minimum or not sweeps.has_sweeps(model):
         return by(recursions if is_written_out else scans)
     # Inside of kernels, what is written out shares its numbers with the rest, such as the rows of loops.
     return by(recursions, by(sweeps), alone=False) if is_written_out else by(sweeps)

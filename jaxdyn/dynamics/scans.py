@@ -42,8 +42,8 @@ class Factor(NamedTuple):
 def _padding(model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Indices (nb, d) of each body's velocities in v, and the mask of those that its joint has."""
     slices = model.topology.v_slices
-    most = max(part.stop - part.start for part in slices)
-    places = np.array([part.start for part in slices])[:, None] + np.arange(most)
+    maximum = max(part.stop - part.start for part in slices)
+    places = np.array([part.start for part in slices])[:, None] + np.arange(maximum)
     own = places < np.array([part.stop for part in slices])[:, None]
     # Any valid index does for padding: the mask removes what it reads.
     return np.where(own, places, 0), own

@@ -343,10 +343,10 @@ def _check_rank(J, s, t) -> None:
     """Refuse a matrix (n, m) of a rank below m."""
     J = np.asarray(J, float)
     # The usual threshold of a numerical rank, max(n, m) eps, with a margin of 10 for the rounding of xi's derivative.
-    least = 10 * max(J.shape) * float(np.finfo(np.asarray(s).dtype).eps)
+    minimum = 10 * max(J.shape) * float(np.finfo(np.asarray(s).dtype).eps)
     # NaN compares false: a Jacobian that is not finite has rank 0 here and is refused. The SVD itself would raise.
     sizes = np.linalg.svd(J, compute_uv=False) if np.isfinite(J).all() else np.full(1, np.nan)
-    rank = int(np.sum(sizes > least * sizes.max(initial=0.0)))
+    rank = int(np.sum(sizes > minimum * sizes.max(initial=0.0)))
     if rank < J.shape[1]:
         where = f"s = {np.asarray(s).tolist()}" if t is None else describe_state(s, t).replace("q =", "s =")
         raise ValueError(

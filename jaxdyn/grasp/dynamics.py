@@ -29,7 +29,7 @@ from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, check_motions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_shape, check_state, zeros_if_none
-from jaxdyn.reduction.bases import least_quality
+from jaxdyn.reduction.bases import min_quality
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -181,7 +181,7 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     whole = rank_of(Jh, inverse) == hands.size
     condition = condition_number(A, inverse)
     # The condition number that the dtype resolves: beyond it the basis N has no correct digits.
-    is_regular = whole & (condition * least_quality(q.dtype) < 1)
+    is_regular = whole & (condition * min_quality(q.dtype) < 1)
     # From the rows of the fingers alone, where A^T is -J_h^T.
     return _solve_dynamics(grasp, q, V, tau, t, N, Ndot, is_regular, lambda left: -matmul(inverse.T, left[hands]))
 
@@ -192,7 +192,7 @@ def _solve_motions(grasp: Grasp, motions: HandMotions, q, nu, tau, t) -> ObjectD
     # N is linearised with its configuration, so that Ndot is exact for any basis.
     v = matmul(place.N, nu)
     Ndot = push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)).N
-    is_regular = place.quality > least_quality(q.dtype)
+    is_regular = place.quality > min_quality(q.dtype)
     A = constraint_jacobian(grasp, q, t)
     inverse = pseudo_inverse(A, tolerance(None, A))
 

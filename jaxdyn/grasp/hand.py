@@ -166,10 +166,10 @@ def _check_object(model: Model, name: str) -> None:
         # Coordinates of the spatial inertia that the joint's velocities see; other joints get no inertia check.
         moved = {"free": range(6), "planar": (0, 1, 5)}.get(top.kinds[body], ())
         matrix = host_math.spatial_inertia(np.asarray(model.inertias, float)[body])[np.ix_(moved, moved)]
-        if len(moved) and not (least := np.linalg.eigvalsh(matrix)[0]) > 0:
+        if len(moved) and not (minimum := np.linalg.eigvalsh(matrix)[0]) > 0:
             raise ValueError(
                 f"inertia of the object {name!r} is not positive definite: the least eigenvalue of its spatial inertia is "
-                f"{least:.3g}; give it a mass and an inertia about every axis, as from jd.inertia.box(mass, size)"
+                f"{minimum:.3g}; give it a mass and an inertia about every axis, as from jd.inertia.box(mass, size)"
             )
 
 

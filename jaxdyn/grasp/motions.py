@@ -28,7 +28,7 @@ from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, as_number, check_state
-from jaxdyn.reduction.bases import Basis, Parametrization, least_quality, orthonormal, split_directions
+from jaxdyn.reduction.bases import Basis, Parametrization, min_quality, orthonormal, split_directions
 from jaxdyn.systems.mass_factor import solve_lower
 from jaxdyn.systems.scene import Scene
 
@@ -68,9 +68,9 @@ class HandMotions(Basis):
         N = N.at[hands, : H.shape[1]].set(matmul(inverse, matmul(seen, H)))
         if self.internal.shape[1]:
             reference = self.internal.astype(A.dtype)
-            K, least, _ = orthonormal(reference - matmul(inverse, matmul(Jh, reference)))
+            K, minimum, _ = orthonormal(reference - matmul(inverse, matmul(Jh, reference)))
             N = N.at[hands, H.shape[1] :].set(K)
-            pivot = jnp.minimum(pivot, least)
+            pivot = jnp.minimum(pivot, minimum)
         # A rank other than at the references changes the number of motions.
         fits = fits & (rank_of(Jh, inverse) == rank)
         size = condition_number(A, inverse)
@@ -267,7 +267,7 @@ def _measure(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability
     # Singular values descend, and velocity axes are their inverses: reversed, the longest velocity axis comes first.
     force_axes, vectors = force_axes[::-1], vectors[:, ::-1]
     # Axes of the square root of the dtype's resolution are zero: the fingers need not move.
-    some = force_axes > least_quality(q.dtype) ** 1.5 * force_axes[-1]
+    some = force_axes > min_quality(q.dtype) ** 1.5 * force_axes[-1]
     velocity_axes = jnp.where(some, 1 / jnp.where(some, force_axes, jnp.ones_like(force_axes)), jnp.inf)
     # Wrenches scale inversely to velocities, so that power remains.
     G = constraint_jacobian(grasp, q, t)[:, objects].T / scale[:, None]

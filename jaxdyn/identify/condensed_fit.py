@@ -40,7 +40,7 @@ _UNIT = 0.1
 _FINE, _ROUGH = 1e-6, 1e-2
 # Fits with weights or loads that follow from the fit before are repeated until one changes all parameters by less than this
 # share of their standard deviations for independent errors; most of them.
-_SETTLED, MOST_ROUNDS = 0.05, 30
+_SETTLED, MAX_ROUNDS = 0.05, 30
 # Least torque noise as a share of the torque, so that noise-free logs stay well posed.
 _FINEST = 1e-6
 

@@ -254,7 +254,7 @@ class InteriorPoint(Method):
         self.tolerance = tolerance
         self.inequalities = int(self.linear.positive.sum())
         # A barrier mu leaves the loss about mu above the minimum for each inequality: together a tenth of the tolerance.
-        self.least = 0.1 * tolerance / max(self.inequalities, 1)
+        self.minimum = 0.1 * tolerance / max(self.inequalities, 1)
 
     def init(self, start, kept):
         """Evaluate the start, with multipliers that make the barrier as strong as the data."""
@@ -282,12 +282,12 @@ class InteriorPoint(Method):
         # Rounding of the loss limits the smallest decrease that is visible.
         smallest = max(self.tolerance, 10 * _EPS * abs(iterate.loss))
         # Half of the decrement is the decrease that Newton's model predicts. It bounds the excess at the final targets alone.
-        if targets == (problem.prior, self.least) and decrement / 2 <= smallest:
+        if targets == (problem.prior, self.minimum) and decrement / 2 <= smallest:
             return iterate, RESULTS.successful
         # Mehrotra's idea: after a long step the barrier decreases much; after a short one the iterate returns to the central path
         # first. Below 0.02 a good step would leave the path, above 0.9 the method would stall.
         share = min(max(0.02, (1 - length) ** 2), 0.9)
-        return self._iterate(following, (max(problem.prior, share * gaps[0]), max(self.least, share * gaps[1]))), None
+        return self._iterate(following, (max(problem.prior, share * gaps[0]), max(self.minimum, share * gaps[1]))), None
 
     def _iterate(self, state: _State, targets: tuple[float, float]) -> Iterate:
         loss = self.problem.loss(state.origin, state.terms)

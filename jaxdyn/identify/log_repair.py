@@ -22,9 +22,9 @@ _UNUSUAL = 15.0
 _ISOLATED = 5.0
 # Least deviation in ranges of the column: smaller ones do not change a fit. Torques are not differentiated, and friction of a
 # recorded KUKA peaks by three ranges for one sample at a reversal, when one of ten samples is kept.
-_LEAST = {"q": 3e-3, "tau": 5.0}
+_MINIMUM = {"q": 3e-3, "tau": 5.0}
 # A constant column has no range: also a share of the widest column of the signal, and a multiple of the encoder's resolution.
-_LEAST_OF_WIDEST, _RESOLUTIONS = 1e-3, 10.0
+_MIN_OF_WIDEST, _RESOLUTIONS = 1e-3, 10.0
 # A jump is faster than its neighbours by the first factor, and than 99 % of the log by the second. Files have limits that are
 # too low, so one beyond the velocity limit must stand out too, though by less: both factors are halved.
 _FASTER, _FASTER_THAN_ALL, _BEYOND_LIMIT = 10.0, 5.0, 1.5
@@ -121,14 +121,15 @@ def find_outliers(log: Log, model: Model | None = None) -> list[Outlier]:
         # Without the extreme hundredths: corrupted samples must not set the range that they are compared with.
         low, high = np.quantile(values[:, list(columns)], (0.01, 0.99), axis=0)
         for place, column in enumerate(columns):
-            least = max(_LEAST[signal] * (high - low)[place], _LEAST_OF_WIDEST * float((high - low).max()))
+            minimum = max(_MINIMUM[signal] * (high - low)[place], _MIN_OF_WIDEST * float((high - low).max()))
             x = values[:, column]
             own = [
-                Outlier(signal, column, rows, size, False) for rows, size in _find_spikes(t, x, least, _LONGEST[signal])
+                Outlier(signal, column, rows, size, False)
+                for rows, size in _find_spikes(t, x, minimum, _LONGEST[signal])
             ]
             if signal == "q":
                 limit = _velocity_limit(model, column)
-                own += _find_jumps(t, x, column, least, limit, own)
+                own += _find_jumps(t, x, column, minimum, limit, own)
             found += sorted(own, key=lambda one: one.rows.start)
     return found
 
@@ -158,12 +159,12 @@ def _turns(t: np.ndarray, x: np.ndarray, near: bool) -> np.ndarray:
     return turns
 
 
-def _find_spikes(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> list[tuple[range, float]]:
+def _find_spikes(t: np.ndarray, x: np.ndarray, minimum: float, longest: int) -> list[tuple[range, float]]:
     """Find one to `longest` samples, rows and deviation, that deviate from the line between their neighbours."""
     n = len(x)
     curvature = np.abs(x[1:-1] - _line(t[1:-1], t[:-2], x[:-2], t[2:], x[2:]))
     # A quantile instead of the maximum: up to a tenth of the samples may be corrupted without raising the floor.
-    floor = max(least, _UNUSUAL * float(np.quantile(curvature, 0.9)))
+    floor = max(minimum, _UNUSUAL * float(np.quantile(curvature, 0.9)))
     found, taken = [], np.zeros(n, bool)
     for length in range(1, longest + 1):
         first = np.arange(2, n - length - 1)  # two samples on both sides
@@ -189,7 +190,7 @@ def _find_spikes(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> li
     return found
 
 
-def _find_jumps(t, x, column: int, least: float, limit: float, known: list[Outlier]) -> list[Outlier]:
+def _find_jumps(t, x, column: int, minimum: float, limit: float, known: list[Outlier]) -> list[Outlier]:
     """Find jumps of a position that stay, outside of known outliers; one to three samples at an end count as isolated."""
     # Spikes are bridged first, or both of their flanks would count as jumps.
     if known:
@@ -208,7 +209,7 @@ def _find_jumps(t, x, column: int, least: float, limit: float, known: list[Outli
         change = np.abs(x[length:] - x[:-length])
         speed = change / np.maximum(t[length:] - t[:-length], usual_step)
         factor = np.where(speed > _BEYOND_LIMIT * limit, 0.5, 1.0)
-        for i in map(int, np.flatnonzero((change > least) & (speed > factor * _FASTER_THAN_ALL * fastest))):
+        for i in map(int, np.flatnonzero((change > minimum) & (speed > factor * _FASTER_THAN_ALL * fastest))):
             sides = [rate[max(0, i - _WINDOW) : i], rate[i + length : i + length + _WINDOW]]
             near = max(float(np.quantile(side, 0.75)) if len(side) else 0.0 for side in sides)
             rows = range(i, i + length + 1)

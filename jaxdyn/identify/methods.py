@@ -24,7 +24,7 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.descent import Iterate, Method, array_leaves, restore_leaves
 
 # Damping of the first step, and its bounds, in shares of the largest curvature.
-DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e6
+DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-12, 1e6
 # Directions with less than this share of the largest effect count as not determined.
 RANK_TOLERANCE = 1e-6
 
@@ -163,7 +163,7 @@ class GaussNewton(Method):
             there = self.linearise(point)
             # A trial that is not finite is one that failed, not an end: a shorter step may be finite.
             if there.is_finite and there.loss < here.loss:
-                return self._iterate(point, there, max(damping / 10, _LEAST_DAMPING)), None
+                return self._iterate(point, there, max(damping / 10, _MIN_DAMPING)), None
             damping *= 10
 
     def arrays(self, iterate):
@@ -192,7 +192,7 @@ def confirm_minimum(result: Any, linear: LinearErrors, tolerance: float, roundin
 def propose(here: LinearErrors, damping: float, tolerance: float) -> np.ndarray | None:
     """Step dy (p,) at a damping; None where it predicts no decrease beyond `tolerance`, or the damping has no effect left."""
     dy, decrease = here.step(damping)
-    return None if damping > _MOST_DAMPING or decrease <= tolerance * here.loss else dy
+    return None if damping > _MAX_DAMPING or decrease <= tolerance * here.loss else dy
 
 
 if TYPE_CHECKING:

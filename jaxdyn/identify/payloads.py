@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.identify.chart import check_bodies
-from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, is_negligible
+from jaxdyn.identify.condensed_fit import MAX_ROUNDS, eliminate, gather, is_negligible
 from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, TorqueProblem, body_chart
 from jaxdyn.identify.logs import Log, as_logs
@@ -224,7 +224,7 @@ def _fit(problem: _Problem, v_s: float):
     start = _start(problem, triangles)
     state = _State(np.zeros(problem.size), start, 1 / sizes)
     rms, result = sizes, RESULTS.max_steps_reached
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         # Weights depend on the errors of the fit and the fit on the weights: iterated.
         before = np.concatenate([state.z, state.u])
         state, has_converged = _minimise(problem, triangles, state, start)
@@ -420,7 +420,7 @@ def fit_payload(
 
     # The load of the gears depends on the payload, which is still zero in the first round.
     has_loads, result = any(term.needs_load for term in extra), RESULTS.max_steps_reached
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         loads = [load + Y @ payload for load, Y in zip(bare, carried, strict=True)]
         data = gather(model, logs, setting.v_s, extra, loads, _BLOCKS, carried=carried)
         blocks, kept = data.blocks, np.append(np.arange(data.basic), data.places(setting.extra))

@@ -51,10 +51,10 @@ def shard_blocks(pieces: Any, devices: Sequence[Any] | None) -> tuple[Any, Any]:
         raise ValueError("devices is empty; give some of jax.devices(), or None for one")
     count = len(jax.tree.leaves(pieces)[0])
     # Shards have equal size; segments added to fill one up would count in the loss.
-    most = max(n for n in range(1, len(devices) + 1) if count % n == 0)
-    if most == 1:
+    maximum = max(n for n in range(1, len(devices) + 1) if count % n == 0)
+    if maximum == 1:
         return pieces, None
-    mesh = jax.make_mesh((most,), (AXIS,), devices=list(devices)[:most], axis_types=(jax.sharding.AxisType.Auto,))
+    mesh = jax.make_mesh((maximum,), (AXIS,), devices=list(devices)[:maximum], axis_types=(jax.sharding.AxisType.Auto,))
     return jax.device_put(pieces, jax.NamedSharding(mesh, jax.P(AXIS))), mesh
 
 

@@ -75,9 +75,9 @@ def from_raw(
 
     Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
     """
-    for name, value, least in (("order", order, 1), ("trim", trim, 0), ("every", every, 1)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-            raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}")
+    for name, value, minimum in (("order", order, 1), ("trim", trim, 0), ("every", every, 1)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < minimum:
+            raise ValueError(f"{name} is {value!r}; give a whole number of at least {minimum}")
     if isinstance(cutoff, str) and cutoff != "auto":
         raise ValueError(f'cutoff is {cutoff!r}; give a frequency in Hz, or "auto"')
     # Before the filter, whose response would spread a corrupted sample over its neighbours.
@@ -128,7 +128,7 @@ def from_raw(
 # friction's. With 99.9 % instead, noise of the encoders of two recorded arms doubled the band.
 _MOTION, _ABOVE = 0.99, 10.0
 # A low-pass closer to the motion than this factor removes rigid-body torque.
-_LEAST = 5.0
+_MINIMUM = 5.0
 # A joint with less than this share of the fastest one's velocity power does not define the band of the motion.
 _SLOW = 1e-4
 # Vibration is a torque whose power rises this many times from one band to a higher one, to this share of the joint's power.
@@ -254,7 +254,7 @@ class _Spectra(NamedTuple):
 
     def valley(self, motion: float) -> tuple[float, float] | None:
         """Band of least torque below a vibration between five and ten times the motion's band, and that of the vibration."""
-        edges = motion * np.arange(_LEAST, _ABOVE + 1)
+        edges = motion * np.arange(_MINIMUM, _ABOVE + 1)
         inside = [(self.frequency >= a) & (self.frequency < b) for a, b in itertools.pairwise(edges)]
         if min(mask.sum() for mask in inside) < _LINES:
             return None
@@ -317,14 +317,14 @@ def _motion(frequency: np.ndarray, position: np.ndarray, velocity: np.ndarray) -
     """
     # Two lines are the resolution of the window.
     band = max(_band(frequency, position, _SLOW), float(frequency[2])) if position.any() else 0.0
-    most = _ABOVE * band
+    maximum = _ABOVE * band
     while band > 0:
         below = frequency <= _ABOVE * band
         higher = max(_band(frequency[below], velocity[below], _SLOW), float(frequency[2]))
         # The iteration comes from below, to the lowest fixed point; higher ones would count more of the noise.
         if higher <= band:
             return band
-        if higher > most:
+        if higher > maximum:
             return np.inf
         band = higher
     return 0.0

@@ -126,7 +126,7 @@ def find_delays(
         problem.refine(setting, fixed, rounds=2)
         parts, _ = splits(problem.data(setting).blocks)
         squares.append(np.array([problem.validation_squares(setting, part).sum(axis=0) for part in parts]))
-    kept = np.isin(every, improving_torques(squares[0], squares[1], least=0.0))
+    kept = np.isin(every, improving_torques(squares[0], squares[1], minimum=0.0))
     return Delays(np.where(kept, delay, 0.0), std, spread.factor, (squares[0], squares[1]))
 
 

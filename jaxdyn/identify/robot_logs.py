@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.identify.condensed_fit import (
-    MOST_ROUNDS,
+    MAX_ROUNDS,
     Data,
     Estimate,
     Intervals,
@@ -118,7 +118,7 @@ class RobotLogs:
             for _ in range(2):
                 self._weigh(setting, self.fit(setting))
 
-    def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int = MOST_ROUNDS) -> Estimate:
+    def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int = MAX_ROUNDS) -> Estimate:
         """Fit and update weights and loads in turn, until the fit has settled.
 
         **Returns:** `Estimate`, whose result is `max_steps_reached` where the last of `rounds` fits has not settled.

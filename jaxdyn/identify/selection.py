@@ -53,11 +53,11 @@ ROBUST = (None, 3.0, 1.345)
 # Quarters of the logs: half of them predict the other half, in every combination.
 _QUARTERS = 4
 # Least decrease of the squared error of left-out blocks for which a term, a loss or another v_s is worth its while.
-_LEAST = 0.01
+_MINIMUM = 0.01
 # The same for a v_s above the default.
 _CURVE = 0.2
 # Share of the splits in which a term must lower the squared error of a joint: five of six.
-_MOST = 0.8
+_MAXIMUM = 0.8
 
 
 class Trial(NamedTuple):
@@ -163,8 +163,8 @@ class Search:
         """Decide whether a setting clearly predicts blocks better than another one, and most of the splits too."""
         gains = log_errors(self(plain).by_split) - log_errors(self(other).by_split)
         # A wide v_s is a curve of friction over the speeds of these logs, and is wrong at others, so that it must gain much.
-        least = _CURVE if other.v_s > plain.v_s else _LEAST
-        return bool(np.mean(gains > 0) >= _MOST) and is_clear(self(plain).squares, self(other).squares, least)
+        minimum = _CURVE if other.v_s > plain.v_s else _MINIMUM
+        return bool(np.mean(gains > 0) >= _MAXIMUM) and is_clear(self(plain).squares, self(other).squares, minimum)
 
     def improving_torques(self, before: Setting, after: Setting) -> tuple[int, ...]:
         """Indices of the torques that a setting predicts better than another one, as `improving_torques`."""
@@ -240,23 +240,23 @@ def _choose_loss(search: Search, setting: Setting, losses, loss_squares: Callabl
     return settings[best if is_lower and is_clear(squares[plain], squares[best]) else plain]
 
 
-def is_clear(before: np.ndarray, after: np.ndarray, least: float = _LEAST) -> bool:
-    """Decide whether squared errors (blocks, nv) decrease by the share `least` and beyond the standard error of the decrease.
+def is_clear(before: np.ndarray, after: np.ndarray, minimum: float = _MINIMUM) -> bool:
+    """Decide whether squared errors (blocks, nv) decrease by the share `minimum` and beyond the standard error of the decrease.
 
     By the logarithms of each block: of the sums, a collision in one block is nearly all, with any loss.
     """
     gains = log_errors(before) - log_errors(after)
     # One-standard-error rule: the best of many settings is better by chance, by about the standard error.
-    return bool(gains.mean() > max(least, standard_error(gains)))
+    return bool(gains.mean() > max(minimum, standard_error(gains)))
 
 
-def improving_torques(before: np.ndarray, after: np.ndarray, least: float = _LEAST) -> tuple[int, ...]:
-    """Indices of the torques whose squared errors (folds, nv) decrease by the share `least` of their sum, and in most folds.
+def improving_torques(before: np.ndarray, after: np.ndarray, minimum: float = _MINIMUM) -> tuple[int, ...]:
+    """Indices of the torques whose squared errors (folds, nv) decrease by the share `minimum` of their sum, and in most folds.
 
     The least share excludes gains that are real and useless.
     """
-    is_large = after.sum(axis=0) < (1 - least) * before.sum(axis=0)
-    return tuple(int(joint) for joint in np.flatnonzero(is_large & (np.mean(after < before, axis=0) >= _MOST)))
+    is_large = after.sum(axis=0) < (1 - minimum) * before.sum(axis=0)
+    return tuple(int(joint) for joint in np.flatnonzero(is_large & (np.mean(after < before, axis=0) >= _MAXIMUM)))
 
 
 def standard_error(gains: np.ndarray) -> float:
@@ -277,7 +277,7 @@ class Shift(NamedTuple):
 
     The root has the scatter over groups, and the pull of the prior (n more columns). `terms`: names and indices of torques;
     `factor`: of a 95 % interval; `clearness`: largest coefficient over its standard deviation, of those that the logs determine;
-    `least`: clearness from which on the terms are named.
+    `minimum`: clearness from which on the terms are named.
     """
 
     terms: tuple[tuple[str, int], ...]
@@ -285,7 +285,7 @@ class Shift(NamedTuple):
     root: np.ndarray
     factor: float
     clearness: float
-    least: float
+    minimum: float
 
 
 def find_shifts(
@@ -343,14 +343,14 @@ def find_shifts(
         sizes, by_prior = np.linalg.norm(both[own:], axis=1), np.linalg.norm(pulled[own:], axis=1)
         ratios = np.abs(step[own:]) / np.maximum(sizes, 1e-300)
         clearness = float(np.max(ratios, where=by_prior**2 <= FROM_PRIOR * sizes**2, initial=0.0))
-        factor, least = student(len(G) - 1), student(len(G) - 1, _LEVEL)
-        return Shift(terms, T[:, kept] @ step, T[:, kept] @ both, factor, clearness, least)
+        factor, minimum = student(len(G) - 1), student(len(G) - 1, _LEVEL)
+        return Shift(terms, T[:, kept] @ step, T[:, kept] @ both, factor, clearness, minimum)
 
     ends = own + np.cumsum([len(places) for _, places in tried])
     indices = {term: np.arange(end - len(places), end) for end, (term, places) in zip(ends, tried, strict=True)}
     every = [extend((term,), new) for term, new in indices.items()]
     shifts = [shift for shift in every if shift is not None and shift.clearness > shift.factor]
-    named = [shift for shift in shifts if shift.clearness > shift.least]
+    named = [shift for shift in shifts if shift.clearness > shift.minimum]
     clearest = {shift.terms[0][1]: shift.terms[0] for shift in sorted(named, key=lambda shift: shift.clearness)}
     if len(clearest) > 1:
         # A second joint's term moves the first joint's parameters too.
@@ -374,7 +374,9 @@ def include_shifts(found: Intervals, shifts: Sequence[Shift], rows: np.ndarray, 
         parameters=parameters,
         base=base,
         base_covariance=found.base_covariance * grown * grown[:, None],
-        omitted=tuple(dict.fromkeys(term for shift in shifts if shift.clearness > shift.least for term in shift.terms)),
+        omitted=tuple(
+            dict.fromkeys(term for shift in shifts if shift.clearness > shift.minimum for term in shift.terms)
+        ),
     )
 
 

@@ -25,7 +25,7 @@ _LEVEL = 1e-3
 # Most independent samples that a log counts for where its errors are those of the model.
 _STATES = 10
 # Eigenvalues of a Hessian of unit diagonal below the first are those of rounding errors; least relative change of a number.
-_ROUNDING, _LEAST_CHANGE = 1e-13, 1e-4
+_ROUNDING, _MIN_CHANGE = 1e-13, 1e-4
 
 
 def block_groups(count: int, size: float) -> list[np.ndarray]:
@@ -108,7 +108,7 @@ def null_space(gram: np.ndarray, curvature: np.ndarray) -> np.ndarray:
 
 def depends_on(rows: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Decide for numbers with the derivatives rows (m, n) whether they change along any of the directions (n, k)."""
-    return np.any(np.abs(rows @ directions) > _LEAST_CHANGE * np.linalg.norm(rows, axis=1, keepdims=True), axis=1)
+    return np.any(np.abs(rows @ directions) > _MIN_CHANGE * np.linalg.norm(rows, axis=1, keepdims=True), axis=1)
 
 
 def student(degrees: int, level: float = 0.05) -> float:
@@ -211,11 +211,11 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray
         # A single sample has no rate, and no frequency but zero.
         rate = log_rate(log) or 1.0
         frequency = np.fft.rfftfreq(len(residual), 1 / rate)
-        most = rate / 2 if log.cutoff is None else min(0.6 * log.cutoff, rate / 2)
+        maximum = rate / 2 if log.cutoff is None else min(0.6 * log.cutoff, rate / 2)
         # Offsets are fitted, so that the mean says nothing.
-        band = (frequency > 0) & (frequency <= most)
+        band = (frequency > 0) & (frequency <= maximum)
         # As shares of each log's band: logs may differ in sampling, length and cut-off.
-        places.append(frequency[band] / most)
+        places.append(frequency[band] / maximum)
         powers.append(np.abs(np.fft.rfft(residual - residual.mean(axis=0), axis=0)[band]) ** 2)
     place, power = np.concatenate(places), np.concatenate(powers)
     count = len(place)

@@ -294,7 +294,7 @@ class NotTaken(dict[str, dict[str, None]]):
 
 
 # Robot joints turn by two or three turns at most, and links are shorter than 100 m; ships and cranes may trigger the warning.
-_MOST_TURNS, _LONGEST = 4.0, 100.0
+_MAX_TURNS, _LONGEST = 4.0, 100.0
 # Limits from here on are none: files write 1e16, the default of SDF up to version 1.6.
 UNLIMITED = 1e15
 
@@ -306,7 +306,7 @@ def warn_of_units(path, model: Model) -> None:
     for name, kind, place in zip(top.joint_names, top.kinds, top.q_slices, strict=True):
         ends = np.abs(np.concatenate([lower[place], upper[place]]))
         # Infinite limits and the huge numbers of files are no limits; they must not count as degrees.
-        if kind == "revolute" and (ends[ends < UNLIMITED] > 2 * np.pi * _MOST_TURNS).any():
+        if kind == "revolute" and (ends[ends < UNLIMITED] > 2 * np.pi * _MAX_TURNS).any():
             doubts.append(f"limits {lower[place][0]:g} to {upper[place][0]:g} rad of joint {name!r} (degrees?)")
     for name, home, parameters in zip(top.body_names, np.asarray(model.home), np.asarray(model.inertias), strict=True):
         if (far := np.linalg.norm(home[:3, 3])) > _LONGEST:

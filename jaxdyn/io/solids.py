@@ -240,9 +240,9 @@ def sdf_elements(file: SdfFile, tag: str, missing: list[str]) -> Iterator[Elemen
 
 FRICTION = 1.0  # where a format or a file has none: the default of Gazebo and of MuJoCo
 # Contacts of a mesh. The equations of a step grow with the square of the number of contacts.
-_MOST_VERTICES = 12
+_MAX_VERTICES = 12
 # Contacts that "ground" gives: of more, the first call of a step takes minutes, and each step a second or so.
-_MOST_CONTACTS = 64
+_MAX_CONTACTS = 64
 
 
 class Collision(NamedTuple):
@@ -327,10 +327,10 @@ def contacts_with_ground(
                 one.frame, shape, one.pose, on=on, friction=friction, name=names.new(name), **options
             )
             taken.add(one.frame)
-    if isinstance(contacts, str) and len(made) > _MOST_CONTACTS:
+    if isinstance(contacts, str) and len(made) > _MAX_CONTACTS:
         raise ValueError(
             f"contacts='ground' gives {len(made)} contacts, of the links {', '.join(sorted(taken))}; a step takes time with the "
-            f"cube of their number, and {_MOST_CONTACTS} are the most of 'ground'. List the links that touch, as "
+            f"cube of their number, and {_MAX_CONTACTS} are the most of 'ground'. List the links that touch, as "
             "contacts=['left_foot', 'right_foot'], or with the number of their lowest corners, {'left_foot': 4}"
         )
     return made, taken
@@ -361,7 +361,7 @@ def _shape(solid: Solid, owner: str) -> tuple[Any, list[str]]:
     size = np.asarray(solid.size)
     if solid.kind == "mesh":
         assert solid.vertices is not None
-        hull, count, error = hull_vertices(solid.vertices * size, _MOST_VERTICES)
+        hull, count, error = hull_vertices(solid.vertices * size, _MAX_VERTICES)
         # A small part of a mesh is exact.
         note = [f"{owner} ({len(hull)} of {count} vertices, within {error:.2g} m)"] if len(hull) < count else []
         return ConvexHull(hull), note

@@ -136,7 +136,7 @@ _NO_PLACES = {"inertial", "visual", "collision", "geom", "camera", "light", "ass
 _NUMBER = re.compile(r"[-+]?(\d*)\.?(\d*)(?:[eE]([-+]?\d+))?$")
 # Numbers of one or two digits (1, 0.5, -1.2) are meant as they stand. Coarser rounding than the largest one cannot be
 # distinguished from a mechanism that does not close; finer rounding than the least one is lost in that of the computation.
-_PLAIN_DIGITS, _LEAST_ROUNDING, LARGEST_ROUNDING = 2, 1e-12, 1e-3
+_PLAIN_DIGITS, _MIN_ROUNDING, LARGEST_ROUNDING = 2, 1e-12, 1e-3
 
 
 def rounding_of_digits(root: ElementTree.Element) -> float:
@@ -152,7 +152,7 @@ def rounding_of_digits(root: ElementTree.Element) -> float:
         whole, decimals, exponent = match.groups()
         if decimals and len((whole + decimals.rstrip("0")).lstrip("0")) > _PLAIN_DIGITS:
             largest = max(largest, 0.5 * 10.0 ** (int(exponent or 0) - len(decimals)))
-    return min(largest, LARGEST_ROUNDING) if largest > _LEAST_ROUNDING else 0.0
+    return min(largest, LARGEST_ROUNDING) if largest > _MIN_ROUNDING else 0.0
 
 
 def _placing_texts(element: ElementTree.Element) -> Iterator[str]:

@@ -213,11 +213,11 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
         return []
     pose = np.eye(4)
     pose[:3, 3] = com
-    least = 1.2 * thin
+    minimum = 1.2 * thin
     if model.topology.kinds[i] == "planar":
         # Inertias of files may be unphysical; a negative moment is drawn as a small solid.
         radius = float(np.sqrt(max(2 * moment[2, 2] / mass, 0.0)))
-        return [Shape(name, "cylinder", (max(radius, least), 2 * least), pose, source="inertia")]
+        return [Shape(name, "cylinder", (max(radius, minimum), 2 * minimum), pose, source="inertia")]
     moments, axes = np.linalg.eigh(moment)
     # eigh may return a reflection; poses need a rotation.
     if np.linalg.det(axes) < 0:
@@ -225,7 +225,7 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
     pose[:3, :3] = axes
     options: dict = dict(source="inertia")
     # A point mass has no shape; a ball of the rods' thickness shows it, and a block what slides.
-    if moments[2] <= mass * least**2:
+    if moments[2] <= mass * minimum**2:
         if model.topology.kinds[i] == "prismatic":
             return [Shape(name, "box", (6 * thin, 6 * thin, 6 * thin), pose, **options)]
         return [Shape(name, "ellipsoid", (2 * thin,) * 3, pose, source="mark")]
@@ -239,14 +239,14 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
         across = moments[0] if axis == 2 else moments[2]
         radius = np.sqrt(max(2 * moments[axis] / mass, 0.0))
         length = np.sqrt(max(12 * across / mass - 3 * radius**2, 0.0))
-        if length > 0 or radius > least:
+        if length > 0 or radius > minimum:
             # A cyclic permutation keeps the axes right-handed, with the cylinder's axis as z.
             permuted = np.roll(axes, 2 - axis, axis=1)
             pose[:3, :3] = permuted
-            size = (max(float(radius), least), max(float(length), least))
+            size = (max(float(radius), minimum), max(float(length), minimum))
             return [Shape(name, "cylinder", size, pose, **options)]
     edges = np.sqrt(np.maximum(6 * (moments.sum() - 2 * moments) / mass, 0.0))
-    return [Shape(name, "box", tuple(float(x) for x in np.maximum(edges, 2 * least)), pose, **options)]
+    return [Shape(name, "box", tuple(float(x) for x in np.maximum(edges, 2 * minimum)), pose, **options)]
 
 
 def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:

@@ -30,7 +30,7 @@ from jaxdyn.reports.plotting import Axes
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
 
-_MOST_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
+_MAX_VERTICES = 400  # of one mesh; matplotlib draws triangles one by one
 _SIDES = 24  # of a round cone
 CONE_HEIGHT = 0.095  # of a friction cone, as a fraction of the mechanism's size
 # Longest side of a triangle, as a fraction of the mechanism's size: matplotlib sorts triangles by the depth of their
@@ -128,7 +128,7 @@ def animate(
         raise ValueError(f"path is {str(path)!r}: there is no directory {path.parent}")
     _matplotlib()
     duration = float(np.ptp(np.asarray(solution.ts))) if hasattr(solution, "ts") else 0.0
-    motion = motion_of(scene, solution, rows=max(2, round(duration / speed * fps) + 1), most=4)
+    motion = motion_of(scene, solution, rows=max(2, round(duration / speed * fps) + 1), maximum=4)
     picture = _Picture(motion, shapes, None, _name_frames(motion.scene.system, frames, points))
     images = picture.images()
     if path.suffix.lower() == ".gif":
@@ -190,7 +190,7 @@ class _Picture:
         model = motion.scene.system
         self.solids = []
         for shape in paint_sectors(parts, model):
-            vertices, faces = simplify(*shape.triangles(), _MOST_VERTICES)
+            vertices, faces = simplify(*shape.triangles(), _MAX_VERTICES)
             vertices, faces = refine(vertices, faces, _LONGEST * self.stage.size)
             # Faces of files may have any orientation, and of a translucent solid both sides show.
             closed = shape.source != "file" and shape.opacity >= 1

@@ -95,8 +95,8 @@ def poses_of(model: Model, qs) -> np.ndarray:
     return np.asarray(_kinematics(model.topology)(model, qs), float)
 
 
-def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | None = None) -> Motion:
-    """Convert a solution, batched or not, or a configuration (nq,) to a motion of at most `rows` rows and `most` trajectories.
+def motion_of(scene: Any, solution: Any, rows: int | None = None, maximum: int | None = None) -> Motion:
+    """Convert a solution, batched or not, or a configuration (nq,) to a motion of at most `rows` rows and `maximum` trajectories.
 
     **Raises:** ValueError for systems without bodies, and for arrays that do not fit the scene.
     """
@@ -123,9 +123,9 @@ def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | No
             "solution.ts differs from motion to motion; save all of them at the same times to show them together"
         )
     extras: list[Any] = [solution.multipliers, solution.torque]
-    if most is not None and len(q) > most:
+    if maximum is not None and len(q) > maximum:
         # Evenly from the batch, since its order often follows a parameter.
-        chosen = np.unique(np.linspace(0, len(q) - 1, most).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(q) - 1, maximum).round().astype(int))
     else:
         chosen = np.arange(len(q))
     kept = np.arange(nt) if rows is None or nt <= rows else select_rows(ts[0], rows)
@@ -144,9 +144,9 @@ def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | No
     return Motion(scene, ts[0, kept], q, poses, *extras)
 
 
-def select_rows(ts: np.ndarray, most: int) -> np.ndarray:
+def select_rows(ts: np.ndarray, maximum: int) -> np.ndarray:
     """Rows evenly spaced in time, as save points need not be."""
-    wanted = np.linspace(ts[0], ts[-1], max(most, 2) if len(ts) > 1 else 1)
+    wanted = np.linspace(ts[0], ts[-1], max(maximum, 2) if len(ts) > 1 else 1)
     return np.unique(np.abs(ts - wanted[:, None]).argmin(1))
 
 
@@ -234,10 +234,10 @@ def forces(motion: Motion) -> list[Force]:
             word = "force" if kind == "prismatic" else "torque"
             arrows.append(Force(top.joint_names[i], word, motion.poses[:, :, i, :3, 3], direction * size))
     # A force that is zero throughout would be an arrow without a direction, and what is left of a difference no friction.
-    most = max(
+    maximum = max(
         (float(np.abs(force.vectors).max(initial=0.0)) for force in arrows if force.kind != "torque"), default=0.0
     )
-    return [f for f in arrows if np.abs(f.vectors).max(initial=0.0) > (0.0 if f.kind == "torque" else 1e-9 * most)]
+    return [f for f in arrows if np.abs(f.vectors).max(initial=0.0) > (0.0 if f.kind == "torque" else 1e-9 * maximum)]
 
 
 def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray) -> Force:

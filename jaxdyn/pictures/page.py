@@ -26,7 +26,7 @@ from jaxdyn.pictures.stage import COLORS, LOOP, Stage, all_solids, color_of, pai
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
 
-MOST_BYTES = 2_000_000  # of a file
+MAX_BYTES = 2_000_000  # of a file
 _FIELD_OF_VIEW = np.deg2rad(40.0)
 _GHOSTS = 7  # motions of a batch in addition to the first
 _GHOST_OPACITY = 0.25
@@ -65,7 +65,7 @@ def view(
     **Raises:** ValueError for a port in use, systems without bodies, arrays that do not fit the scene. ImportError
     without viser.
     """
-    motion = motion_of(scene, solution, rows=_SERVED[1], most=1 + _GHOSTS)
+    motion = motion_of(scene, solution, rows=_SERVED[1], maximum=1 + _GHOSTS)
     parts = all_solids(motion, shapes)
     viewer = Viewer(motion, parts, free_port(port))
     print(f"Showing the motion at {viewer.url}")
@@ -113,7 +113,7 @@ def save_html(
     if not path.parent.is_dir():
         raise ValueError(f"path is {str(path)!r}: there is no directory {path.parent}")
     # All rows: `_document` chooses them anew for each size.
-    motion = motion_of(scene, solution, most=1 + _GHOSTS)
+    motion = motion_of(scene, solution, maximum=1 + _GHOSTS)
     path.write_text(_document(motion, all_solids(motion, shapes)), encoding="utf-8")
 
 
@@ -184,10 +184,10 @@ def _document(motion: Motion, parts: Shapes) -> str:
                 serializer.insert_sleep(float(motion.ts[row] - motion.ts[before]))
                 content.show(int(row))
             text = serializer.as_html()
-        if len(text) <= MOST_BYTES:
+        if len(text) <= MAX_BYTES:
             return text
     raise ValueError(
-        f"the page has {len(text) / 1e6:.1f} MB, more than {MOST_BYTES / 1e6:g} MB; show fewer motions: jax.tree.map(lambda x: "
+        f"the page has {len(text) / 1e6:.1f} MB, more than {MAX_BYTES / 1e6:g} MB; show fewer motions: jax.tree.map(lambda x: "
         "x[:2], solution)"
     )
 
@@ -285,7 +285,7 @@ def _attitude(cone: Cone, row: int) -> np.ndarray:
     return np.stack([first, np.cross(axis, first), axis], 1)
 
 
-def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
+def _meshes(motion: Motion, parts: Shapes, maximum: int) -> Iterator[tuple]:
     """Yield frame, colour, opacity, vertices and faces, one mesh for each frame and colour."""
     alike: dict[tuple, list] = {}
     for shape in parts:
@@ -293,7 +293,7 @@ def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
     groups = [(*key, [shape.triangles() for shape in members]) for key, members in alike.items()]
     total = sum(len(vertices) for *_, meshes in groups for vertices, _ in meshes)
     # Each mesh keeps the same fraction of its vertices, so that large ones do not use up the budget.
-    share = min(1.0, most / max(total, 1))
+    share = min(1.0, maximum / max(total, 1))
     for frame, color, opacity, meshes in groups:
         # A lower bound keeps small parts recognisable.
         small = [simplify(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in meshes]

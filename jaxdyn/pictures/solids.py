@@ -125,19 +125,19 @@ def refine(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.
     return vertices, faces
 
 
-def simplify(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Simplify a mesh to about `most` vertices by merging those within a cell of a grid.
+def simplify(vertices: np.ndarray, faces: np.ndarray, maximum: int) -> tuple[np.ndarray, np.ndarray]:
+    """Simplify a mesh to about `maximum` vertices by merging those within a cell of a grid.
 
     The grid is made coarser until the mesh is small enough; a mesh that is small enough is returned unchanged.
 
     Source: Rossignac and Borrel (1993), Multi-resolution 3D approximations for rendering complex scenes.
     """
     low, extent = vertices.min(0), np.ptp(vertices, axis=0).max()
-    cells = int(np.sqrt(most) * 1.5) + 2  # a surface in a cube of n cells an edge fills some n^2 of them
-    while len(vertices) > most and cells > 2 and extent > 0:
+    cells = int(np.sqrt(maximum) * 1.5) + 2  # a surface in a cube of n cells an edge fills some n^2 of them
+    while len(vertices) > maximum and cells > 2 and extent > 0:
         place = np.floor((vertices - low) / extent * cells).astype(int) @ (1, cells + 1, (cells + 1) ** 2)
         _, index, count = np.unique(place, return_inverse=True, return_counts=True)
-        if len(count) <= most:
+        if len(count) <= maximum:
             centres = np.stack([np.bincount(index, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
             merged = index[faces]
             # Triangles with two corners in one cell have become lines.

@@ -141,9 +141,9 @@ class UserBasis(Basis):
     def advice(self, scene, q, t):
         """Advise by the rank and the residual of its columns."""
         A, N = constraint_jacobian(scene, q, t), self.at(scene, q, t).N
-        most = scene.nv - np.linalg.matrix_rank(np.asarray(A), tol=1e-9 * float(jnp.max(jnp.abs(A))))
+        maximum = scene.nv - np.linalg.matrix_rank(np.asarray(A), tol=1e-9 * float(jnp.max(jnp.abs(A))))
         return (
-            f"return {most} independent columns with A N = 0 and, where b != 0, a v0 with A v0 = b (rank "
+            f"return {maximum} independent columns with A N = 0 and, where b != 0, a v0 with A v0 = b (rank "
             f"{np.linalg.matrix_rank(np.asarray(N))} of {N.shape[1]}, largest |A N| "
             f"{float(jnp.max(jnp.abs(matmul(A, N)))):.3g})"
         )
@@ -365,7 +365,7 @@ def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Floa
     return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots), factor
 
 
-def least_quality(dtype) -> float:
+def min_quality(dtype) -> float:
     """Quality below which a parametrisation counts as singular: reciprocal condition 5e-7 in float64."""
     return float(jnp.finfo(dtype).eps) ** REGULAR
 

@@ -79,7 +79,7 @@ def involutive(
     count, limit = reference.shape[1], tolerance(rank_tol, q)
     # Brackets stay tangent to the holonomic constraints.
     A_holonomic = np.asarray(constraint_jacobian_compiled(scene, q, t))[holonomic_rows(layout(scene))]
-    most = scene.nv - (
+    maximum = scene.nv - (
         int(np.linalg.matrix_rank(A_holonomic, tol=1e-9 * np.abs(A_holonomic).max())) if A_holonomic.size else 0
     )
     # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
@@ -98,7 +98,7 @@ def involutive(
         evidence.append(sizes)
         # A level spans that before. Much longer brackets raise the threshold, which must not take dimensions away again.
         ranks.append(max(int(np.sum(sizes > limit * sizes[0])), *ranks[-1:], 0))
-        if len(ranks) > 1 and (ranks[-1] == ranks[-2] or ranks[-1] >= most):
+        if len(ranks) > 1 and (ranks[-1] == ranks[-2] or ranks[-1] >= maximum):
             return Involutivity(ranks[-1] == ranks[0], tuple(ranks), tuple(evidence))
         # With constant rank, the fields that are independent at q span the level around it.
         # Directions in the span already are removed once; pivoting, the largest first, then needs only the new columns.

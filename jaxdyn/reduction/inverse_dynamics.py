@@ -223,12 +223,12 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
         x = x + matmul(free.T, independent - matmul(Z.T, x))
         size = jnp.sqrt(jnp.sum(x * x)) + jnp.sqrt(jnp.sum(start * start))
         # Rounding of what is quadratic in the velocities may be all that a right-hand side has.
-        least = 100 * eps_of(q) * (eps_of(q) + jnp.sum(v * v))
+        minimum = 100 * eps_of(q) * (eps_of(q) + jnp.sum(v * v))
         # By Cauchy-Schwarz a residual is compared with the sizes that cancel in it.
         fits = [
             jnp.all(
                 jnp.abs(matmul(B.T, x) - wanted)
-                <= limit * (jnp.abs(wanted) + jnp.sqrt(jnp.sum(B * B, 0)) * size) + least
+                <= limit * (jnp.abs(wanted) + jnp.sqrt(jnp.sum(B * B, 0)) * size) + minimum
             )
             for B, wanted in ((Y, right), (Z, independent))
             if B.shape[1]

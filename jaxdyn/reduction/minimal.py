@@ -36,7 +36,7 @@ from jaxdyn.reduction.bases import (
     VelocityAndDrift,
     as_basis,
     count_dof,
-    least_quality,
+    min_quality,
     orthonormal,
     split_directions,
 )
@@ -137,7 +137,7 @@ def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> Reduced
     rate = solve_cholesky(factor, force - bias)
     result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)
     # The sign of the quality is that of a determinant, and no measure.
-    is_regular = jnp.abs(quality) > least_quality(q.dtype)
+    is_regular = jnp.abs(quality) > min_quality(q.dtype)
     result = require_finite(RESULTS.where(is_regular, result, RESULTS.singular_basis), rate)
     return ReducedDynamics(rate, v, matmul(N, rate) + drift, mass, bias, force, N, result)
 

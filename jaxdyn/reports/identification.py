@@ -259,7 +259,7 @@ def _numbers(values: np.ndarray) -> list[float | None]:
     return [float(x) if np.isfinite(x) else None for x in values]
 
 
-_MOST_SAMPLES = 1500
+_MAX_SAMPLES = 1500
 
 
 def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title: str, text: str) -> str:
@@ -270,7 +270,7 @@ def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title:
     parts = [text_block(text)]
     for number, one in enumerate(findings.tests):
         # Each sample is a point of an SVG path: whole logs would make pages of many megabytes.
-        rows = slice(0, len(one.log), max(1, len(one.log) // _MOST_SAMPLES))
+        rows = slice(0, len(one.log), max(1, len(one.log) // _MAX_SAMPLES))
         figure = torque_figure(one.log[rows], one.predicted[rows], labels, units, title=one.name)
         parts += [
             f"<h2>{html.escape(one.name)}</h2>",

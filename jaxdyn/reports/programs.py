@@ -78,7 +78,7 @@ SOLVERS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "RK4": RK4,
 }
 FIXED = frozenset({"RK4"})
-MOST_STEPS = 2**17
+MAX_STEPS = 2**17
 # Fraction of the time span over which the starts of a batch are spread along the motion.
 SPREAD = 0.1
 
@@ -112,7 +112,7 @@ class Programs:
         def one(q, v, ts, setting):
             # The setting is an argument of the program: a ladder of tolerances compiles once.
             size, tolerance = (setting, None) if solver in FIXED else (None, setting)
-            steps = Steps(size, rtol=tolerance, atol=tolerance, max_steps=MOST_STEPS)
+            steps = Steps(size, rtol=tolerance, atol=tolerance, max_steps=MAX_STEPS)
             # Only the integration is measured: contacts that pull are reported and do not end it.
             options = {"method": method, "solver": SOLVERS[solver](), "stepsize": steps, "throw": False}
             options["events"] = () if scene.cones is None else (ContactLost(stop=False),)

@@ -119,11 +119,16 @@ def judge(prepared: Prepared, motion: Motion) -> dict:
 
 
 def measure(
-    prepared: Prepared, contestants: Sequence[Contestant], dtype: str, batch: int, rounds: int = 20, most: float = 10.0
+    prepared: Prepared,
+    contestants: Sequence[Contestant],
+    dtype: str,
+    batch: int,
+    rounds: int = 20,
+    maximum: float = 10.0,
 ) -> list[Record]:
     """Run every contestant, evaluate its motion, and time all of them interleaved.
 
-    `most`: seconds after which a slow one drops out of the rounds; one whose first run takes more than a quarter of
+    `maximum`: seconds after which a slow one drops out of the rounds; one whose first run takes more than a quarter of
     that is timed once only. Its record has the number of rounds.
     """
     motions, times, calls = [], {}, {}
@@ -133,11 +138,11 @@ def measure(
         outputs = contestant.call()
         passed = time.perf_counter() - began
         motions.append(contestant.motion(outputs))
-        if passed > most / 4:
+        if passed > maximum / 4:
             times[i] = {"best": passed, "median": passed, "rounds": 1}
         else:
             calls[i] = contestant.call
-    times |= time_alternately(calls, rounds, most=most)
+    times |= time_alternately(calls, rounds, maximum=maximum)
     return [
         Record(
             scene=prepared.case.name,
@@ -163,12 +168,12 @@ def measure(
     ]
 
 
-def time_alternately(contestants: dict, rounds: int = 20, least: float = 0.02, most: float = float("inf")) -> dict:
+def time_alternately(contestants: dict, rounds: int = 20, minimum: float = 0.02, maximum: float = float("inf")) -> dict:
     """Seconds per call of each contestant over several rounds: {name: {"best", "median", "rounds" (their number)}}.
 
-    **Arguments:** `contestants`: {name: a function of no arguments that returns when its computation is done}. `least` (s): calls
-    that are shorter are repeated within a round until they take this long together. `most` (s): a contestant that has used this
-    much time drops out once it has three rounds, enough for a median.
+    **Arguments:** `contestants`: {name: a function of no arguments that returns when its computation is done}. `minimum` (s):
+    calls that are shorter are repeated within a round until they take this long together. `maximum` (s): a contestant that has
+    used this much time drops out once it has three rounds, enough for a median.
     """
     repeats, spent = {}, {}
     for call in contestants.values():
@@ -179,11 +184,11 @@ def time_alternately(contestants: dict, rounds: int = 20, least: float = 0.02, m
         call()
         spent[name] = time.perf_counter() - start
         # Repeated, because a clock and the dispatch would dominate the time of a short call.
-        repeats[name] = max(1, int(least / max(spent[name], 1e-7)))  # no call is faster than 0.1 us
+        repeats[name] = max(1, int(minimum / max(spent[name], 1e-7)))  # no call is faster than 0.1 us
     samples = {name: [] for name in contestants}
     for index in range(rounds):
         for name, call in contestants.items():
-            if index >= 3 and spent[name] > most:
+            if index >= 3 and spent[name] > maximum:
                 continue
             start = time.perf_counter()
             for _ in range(repeats[name]):

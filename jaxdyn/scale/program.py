@@ -141,8 +141,8 @@ class Program:
         # `check_vma` checks values that are equal on all devices. Here every value belongs to one device.
         mapped = jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
         batch = jax.jit(mapped)
-        least = len(self.devices)  # one member for each device; sizes are multiples of it
-        self.size = max(least, -(-size // least) * least)
+        minimum = len(self.devices)  # one member for each device; sizes are multiples of it
+        self.size = max(minimum, -(-size // minimum) * minimum)
         while True:
             shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct((self.size, *x.shape), x.dtype), one.inputs)
             lowered = batch.lower(shapes)
@@ -151,15 +151,15 @@ class Program:
             self.bytes = self._program_bytes()
             if self.bytes <= memory:
                 break
-            if self.size == least:
+            if self.size == minimum:
                 raise MemoryError(
-                    f"a program of {least} rollouts needs {self.bytes / 2**20:.3g} MiB, and {memory / 2**20:.3g} MiB are allowed "
-                    "(half of what is free); save fewer points or outputs, or take fewer devices"
+                    f"a program of {minimum} rollouts needs {self.bytes / 2**20:.3g} MiB, and {memory / 2**20:.3g} MiB are "
+                    "allowed (half of what is free); save fewer points or outputs, or take fewer devices"
                 )
             # Memory is nearly proportional to the size. A tenth less makes it likely that the next program fits. Sizes are at
             # least halved, which bounds the number of compilations.
             fitting = int(0.9 * self.size * memory / self.bytes)
-            self.size = max(least, min(fitting, self.size // 2) // least * least)
+            self.size = max(minimum, min(fitting, self.size // 2) // minimum * minimum)
         self._first: tuple[np.ndarray, Any] | None = None
 
     def start(self, numbers: np.ndarray) -> Any:

@@ -312,11 +312,11 @@ class Reducer:
 class Totals:
     """Result codes, failures and reductions of a run, from summaries of chunks that are added in the order of the chunks.
 
-    `codes`: number of rollouts that ended with each code; `failed`: numbers of the first `most` that failed.
+    `codes`: number of rollouts that ended with each code; `failed`: numbers of the first `maximum` that failed.
     """
 
-    def __init__(self, reducer: Reducer, codes: int, most: int):
-        self._reducer, self._most = reducer, most
+    def __init__(self, reducer: Reducer, codes: int, maximum: int):
+        self._reducer, self._maximum = reducer, maximum
         self.codes = np.zeros(codes, np.int64)
         self.failed = np.zeros(0, np.int64)
         self._partials: Results | None = None
@@ -325,7 +325,7 @@ class Totals:
         """Add the summary of the next chunk."""
         self.codes += summary.codes
         # Summaries come in the order of the chunks, so that these are the first failures for any number of workers.
-        self.failed = np.concatenate([self.failed, summary.failed[: self._most - len(self.failed)]])
+        self.failed = np.concatenate([self.failed, summary.failed[: self._maximum - len(self.failed)]])
         before, partials = self._partials, summary.partials
         self._partials = partials if before is None else self._reducer.combine(before, partials)
 

@@ -43,7 +43,7 @@ SECONDS = 2.0  # of computing per chunk, if it may be so large
 BYTES = 2**25  # of rows in a chunk
 SHARES = 8  # chunks per worker at least, so that all end at about the same time
 CHECKED = 64  # chunks that one task checks
-MOST_FAILURES = 100  # chunks that fail before no others are tried
+MAX_FAILURES = 100  # chunks that fail before no others are tried
 FULL = (errno.ENOSPC, errno.EDQUOT)  # of a disk
 
 
@@ -113,13 +113,13 @@ class Resources:
     progress: bool = True
 
     def __post_init__(self):
-        for name, least in (("batch_size", 1), ("chunk", 1), ("retries", 0)):
+        for name, minimum in (("batch_size", 1), ("chunk", 1), ("retries", 0)):
             value = getattr(self, name)
-            is_default = value is None and least
+            is_default = value is None and minimum
             # bool is a subclass of int: True would pass as 1.
-            if not is_default and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+            if not is_default and (isinstance(value, bool) or not isinstance(value, int) or value < minimum):
                 raise ValueError(
-                    f"{name} is {value!r}; give a whole number of at least {least}{', or None' if least else ''}"
+                    f"{name} is {value!r}; give a whole number of at least {minimum}{', or None' if minimum else ''}"
                 )
         if self.client is None:
             local_devices(self.devices)
@@ -302,9 +302,9 @@ def _run_batch(
         engine = Local(retries, 2) if client is None else Cluster(client, retries, mark, 2)
         with engine:
             # Not larger than a chunk has to be, so that a batch is never filled up for nothing.
-            most = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
+            maximum = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
             fixed = outputs, batch, reducer, kept, path.absolute(), resources.devices, resources.batch_size
-            engine.send(Study(*fixed, most, engine.workers_per_host).open)
+            engine.send(Study(*fixed, maximum, engine.workers_per_host).open)
             # On one worker, for all: they have the same program, and the store is created once.
             facts: Facts = engine.call("facts", store is None)
             # Platforms round differently, so that a store keeps to one; it is known when a worker has its devices.
@@ -349,7 +349,7 @@ def _compute_chunks(engine: Engine, store: Store, totals: Totals, resources: Res
                     ) from summaries.error
                 failures.append((chunks[0], summaries))
                 # So many failures have a common cause, which the other chunks would meet too.
-                if len(failures) == MOST_FAILURES:
+                if len(failures) == MAX_FAILURES:
                     break
                 continue
             for chunk, summary in zip(chunks, summaries, strict=True):
@@ -394,7 +394,7 @@ def _progress_meter(total: int, before: int, is_shown: bool) -> Any:
 def _chunk_error(failures: list[tuple[int, Failure]], store: Store) -> RuntimeError:
     chunks = ", ".join(str(chunk) for chunk, _ in failures[:10]) + (", ..." if len(failures) > 10 else "")
     first = failures[0][1]
-    kept = "no others were tried" if len(failures) == MOST_FAILURES else "the others are finished"
+    kept = "no others were tried" if len(failures) == MAX_FAILURES else "the others are finished"
     error = RuntimeError(
         f"out is {str(store.path)!r}: of {store.chunks} chunks {len(failures)} failed in every attempt ({chunks}), {kept} and "
         f"kept; run again to try those alone. Chunk {failures[0][0]}:\n{first.traceback}"
@@ -405,8 +405,8 @@ def _chunk_error(failures: list[tuple[int, Failure]], store: Store) -> RuntimeEr
 
 def _chunk_size(facts: Facts, row_bytes: int, count: int, workers: int) -> int:
     """Rollouts of a chunk: some seconds of work, not too many bytes, and enough chunks for each worker; whole batches."""
-    most = BYTES / max(row_bytes * facts.size, 1), count / (SHARES * workers * facts.size)
-    batches = min(SECONDS / max(facts.seconds, 1e-6), *most)
+    maximum = BYTES / max(row_bytes * facts.size, 1), count / (SHARES * workers * facts.size)
+    batches = min(SECONDS / max(facts.seconds, 1e-6), *maximum)
     return min(facts.size * max(1, int(batches)), count)
 
 

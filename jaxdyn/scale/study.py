@@ -190,7 +190,7 @@ class Study:
     """All that determines the rows of a batch; it is sent to workers and compiled there.
 
     - `outputs`: the function of a member; `kept`: names of the arrays that are stored.
-    - `size` or None: members of a batch, by default at most `most`. `sharing`: processes that share the free memory of a host.
+    - `size` or None: members of a batch, by default at most `maximum`. `sharing`: processes that share the free memory of a host.
       `devices`: None for all of a process.
     """
 
@@ -201,7 +201,7 @@ class Study:
     path: Path
     devices: Sequence[Any] | None
     size: int | None
-    most: int
+    maximum: int
     sharing: int
 
     def open(self) -> "Study":
@@ -220,7 +220,7 @@ class Study:
     def program(self) -> Program:
         """The program of a batch."""
         devices = local_devices(self.devices)
-        size = self.size or max(1, min(default_size(devices), self.most))
+        size = self.size or max(1, min(default_size(devices), self.maximum))
         memory = MEMORY_FRACTION * available_memory(devices) / self.sharing
         return Program(self.outputs.traced, devices, size, memory, self.outputs.is_motion)
 

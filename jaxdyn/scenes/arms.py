@@ -176,11 +176,11 @@ def _lifting_start(
     q = as_state([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
     twist = as_leaf(twist)
     # Joint velocities of least norm that move the flanges with the plate.
-    return q, _least_rates(scene, q, twist)
+    return q, _min_rates(scene, q, twist)
 
 
 @entry_point
-def _least_rates(scene, q, twist):
+def _min_rates(scene, q, twist):
     J = hand_jacobian(scene, q)
     rates = pseudo_inverse(J, tolerance(None, J)) @ (grasp_map(scene, q).T @ twist)
     return jnp.concatenate([rates, twist])

@@ -245,7 +245,7 @@ def _tip(model, joints, offset, angles):
     return place, xp.cross(xp.stack(axes), place[None] - xp.stack(origins)).T
 
 
-def _least(jacobian, motion):
+def _minimum(jacobian, motion):
     """Change of a finger's angles of least norm for a motion of its tip."""
     # Four joints for three components: the normal equations J J^T are regular away from singularities.
     return jacobian.T @ solve_gram(jacobian, motion)
@@ -256,7 +256,7 @@ def _reach(model, joints, offset, guess, target):
 
     def nearer(angles, _):
         place, jacobian = _tip(model, joints, offset, angles)
-        return angles + _least(jacobian, target - place), None
+        return angles + _minimum(jacobian, target - place), None
 
     if is_concrete(target):
         for _ in range(_ROUNDS):
@@ -295,7 +295,7 @@ def _cube_start(
             )
         # The twist is in the cube's axes, and the fingers are computed in those of the world.
         velocity = point_velocity(position, rotation @ twist[:3], rotation @ twist[3:], target)
-        moving = _least(jacobian, velocity)
+        moving = _minimum(jacobian, velocity)
         for k, i in enumerate(joints):
             angles[i], rates[i] = reached[k], moving[k]
     # The cube's joint is last in the order of names.

@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool
 from jaxdyn.compile.known import is_concrete, once
 from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
-from jaxdyn.constraints.rank import LEAST_GAP
+from jaxdyn.constraints.rank import MIN_GAP
 from jaxdyn.constraints.redundancy import holds_rows, keep_rows
-from jaxdyn.constraints.selection import count_free, most_rounding, rows_and_doubts, select_rows
+from jaxdyn.constraints.selection import count_free, max_rounding, rows_and_doubts, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.contact.shapes import LowestCorner
 from jaxdyn.dynamics.quantities import mass_matrix
@@ -284,7 +284,7 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     with jax.ensure_compile_time_eval():  # known numbers stay known while a function around is traced
         selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
     ratio = start_openness(selected, relative=limit)(q, v, t)
-    if ratio <= 1 and selection.rounding > most_rounding(q.dtype):
+    if ratio <= 1 and selection.rounding > max_rounding(q.dtype):
         raise ValueError(
             f"rows of the constraints contradict each other: they depend on others, but are open by "
             f"{float(selection.rounding):.2g} of their size ({open_constraints(scene, q, v, t, limit)}); leave them out"
@@ -296,10 +296,10 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
             f"{float(residuals[0]):.3g}, velocity residual {float(residuals[1]):.3g}); start from "
             "state = jd.assemble(scene, q0, v0), with state.q and state.v"
         )
-    if selection.gap < LEAST_GAP:
+    if selection.gap < MIN_GAP:
         raise ValueError(
             "the rank of the constraints is not clear: rows that are independent of the others differ by less than a factor of "
-            f"{LEAST_GAP:g} from rows that repeat them; give numbers with more digits, or method=jd.Projected(rank_tol=...)"
+            f"{MIN_GAP:g} from rows that repeat them; give numbers with more digits, or method=jd.Projected(rank_tol=...)"
         )
     if rank == scene.nv:
         names = ", ".join(repr(place.name) for place in layout(scene))

@@ -417,9 +417,9 @@ def may_contradict(contacts: Contacts, scene: Scene) -> bool:
 
 def closing_cones(contacts: Contacts, problem: Scaled, x) -> Array:
     """Mask (k,) of the contacts that close by their velocities, or in impulses x (m,) that push others onto them."""
-    least = 1e-6 * jnp.max(jnp.abs(x))
+    minimum = 1e-6 * jnp.max(jnp.abs(x))
     normals, closing = contacts.normals, np.array(contacts.closing)
-    return closing & ((problem.q[normals] < 0) | (x[normals] > least))
+    return closing & ((problem.q[normals] < 0) | (x[normals] > minimum))
 
 
 def make_consistent(contacts: Contacts, problem: Scaled, closes) -> Scaled:

@@ -74,9 +74,9 @@ class ModeSwitches:
     max_events: int = 256
 
     def __post_init__(self):
-        most = self.max_events
-        if isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1:
-            raise ValueError(f"max_events is {most!r}; pass a positive integer, such as 64")
+        maximum = self.max_events
+        if isinstance(maximum, bool) or not isinstance(maximum, (int, np.integer)) or maximum < 1:
+            raise ValueError(f"max_events is {maximum!r}; pass a positive integer, such as 64")
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.constraints.rank import check_tolerance
-from jaxdyn.constraints.redundancy import most_opening, opening_of_redundant, openness, residual_of_redundant
-from jaxdyn.constraints.selection import most_rounding
+from jaxdyn.constraints.redundancy import max_opening, opening_of_redundant, openness, residual_of_redundant
+from jaxdyn.constraints.selection import max_rounding
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, as_float, check_count, state_dtype
@@ -39,7 +39,7 @@ from jaxdyn.reduction.bases import (
     UserBasis,
     VelocityAndDrift,
     as_basis,
-    least_quality,
+    min_quality,
     tangent_basis,
 )
 from jaxdyn.reduction.minimal import minimal_velocity, solve_in_basis
@@ -153,7 +153,7 @@ class Multipliers(Method):
         """True if `constrained_dynamics` finds no contradiction, and the rows that were dropped at the start agree."""
         motion = dynamics(scene, q, v, t, force, self.rank_tol)
         is_solved = motion.result != RESULTS.contradictory_rows
-        return is_solved & (residual_of_redundant(scene, q, v, t, motion.acceleration) <= most_rounding(q.dtype))
+        return is_solved & (residual_of_redundant(scene, q, v, t, motion.acceleration) <= max_rounding(q.dtype))
 
 
 class Projected(Multipliers):
@@ -340,7 +340,7 @@ def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
 
 def is_regular(quality) -> Array:
     """True if a quality (see `Method.quality`) is far enough from zero; false for NaN."""
-    return jnp.abs(quality) > least_quality(quality.dtype)
+    return jnp.abs(quality) > min_quality(quality.dtype)
 
 
 def start_limit(dtype) -> float:
@@ -356,7 +356,7 @@ def consistent(scene: Scene, q, v, t):
 
 def satisfies_redundant_rows(scene: Scene, q, v, t):
     """True if the rows that were dropped at the start of a motion are still satisfied."""
-    return opening_of_redundant(scene, q, t, v) <= most_opening(scene, q.dtype)
+    return opening_of_redundant(scene, q, t, v) <= max_opening(scene, q.dtype)
 
 
 def may_have_redundant_rows(scene: Scene) -> bool:

@@ -15,9 +15,9 @@ from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import map_rows
 from jaxdyn.compile.known import Known
 from jaxdyn.constraints.codes import first_of
-from jaxdyn.constraints.rank import LEAST_GAP
+from jaxdyn.constraints.rank import MIN_GAP
 from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, rows_of
-from jaxdyn.constraints.selection import most_rounding, select_rows
+from jaxdyn.constraints.selection import max_rounding, select_rows
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import Inputs, angle_coordinates, has_definite_mass, largest_angle, safe_inputs
 from jaxdyn.simulation.equations import DRIVES, KEPT, WITHIN, Equations, at_save_point, equations
@@ -146,8 +146,8 @@ def _project_start(scene: Scene, method: Method, inputs: Inputs, selects_rows: b
     if selects_rows:
         selection = select_rows(scene, q0, t0, method.rank_tol)
         scene = keep_rows(scene, selection)
-        start_ok = selection.rounding <= most_rounding(q0.dtype)
-        faults.append((selection.gap < LEAST_GAP, RESULTS.unclear_rank))
+        start_ok = selection.rounding <= max_rounding(q0.dtype)
+        faults.append((selection.gap < MIN_GAP, RESULTS.unclear_rank))
         faults.append((~(jnp.sum(selection.kept) < scene.nv), RESULTS.no_freedom))
     if scene.constraints:
         start_ok = start_ok & consistent(scene, q0, v0, t0)
@@ -387,12 +387,12 @@ def _by_pieces(plan: Plan, eqs: Equations, inputs, controller, steps, options: O
     system = PiecewiseSystem(plan, eqs.pieces, eqs.switching)
     rtol, atol, stepsize = steps
     (y0, args, ts), has_length = inputs, is_step_length(stepsize)
-    room, most = options.max_steps, max(MIN_EVENTS, options.max_events)
+    room, maximum = options.max_steps, max(MIN_EVENTS, options.max_events)
     if not has_length:
         rtol, atol, stepsize = controller.rtol, controller.atol, None
         room = room if options.limit_is_given else min(room, ROOM)
     rows, end = piecewise_motion(
-        system, y0, args, ts, rtol, atol, stepsize, options.max_steps, room, most, _is_direct(options.adjoint)
+        system, y0, args, ts, rtol, atol, stepsize, options.max_steps, room, maximum, _is_direct(options.adjoint)
     )
     return Outcome(rows, end.result, end.counts, end.t)
 
@@ -400,15 +400,15 @@ def _by_pieces(plan: Plan, eqs: Equations, inputs, controller, steps, options: O
 def _by_steps(solver: LibrarySteps, plan: Plan, controller, inputs, steps, options: Options) -> Outcome:
     """Integrate by explicit steps in the library's own loop."""
     # Attempts that locate the end do not count among the user's steps.
-    most = options.max_steps + (0 if plan.guards is None else 2 * SEARCH_STEPS)
+    maximum = options.max_steps + (0 if plan.guards is None else 2 * SEARCH_STEPS)
     if isinstance(controller, Adaptive):
         room, control = (
-            most if options.limit_is_given else min(most, ROOM),
+            maximum if options.limit_is_given else min(maximum, ROOM),
             step_control(solver, None, controller.norm),
         )
-        run = LibraryRun(plan, control, controller.rtol, controller.atol, None, most, room=room)
+        run = LibraryRun(plan, control, controller.rtol, controller.atol, None, maximum, room=room)
     else:
-        run = LibraryRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], most, room=most)
+        run = LibraryRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], maximum, room=maximum)
     rows, (result, counts, reached) = (run.direct if _is_direct(options.adjoint) else run)(*inputs)
     if plan.guards is None:
         return Outcome(rows, result, counts, reached)

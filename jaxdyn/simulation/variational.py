@@ -56,8 +56,8 @@ from jaxdyn.systems.system import displace
 
 _GROUPS: dict[str, Any] = {"planar": se2, "spherical": so3, "free": se3}
 # Newton's method keeps a Jacobian for up to six iterations while each one shrinks the change to less than 0.3 of the last.
-_MOST_JACOBIANS = 8
-_MOST_REPEATS = 6
+_MAX_JACOBIANS = 8
+_MAX_REPEATS = 6
 _CONTRACTION = 0.3
 
 
@@ -171,7 +171,7 @@ def _newton(function, jacobian, z, n: int):
         z, change, before, count = state
         # The next change is estimated by the ratio of the last two.
         far = change * jnp.minimum(change / before, 1.0) > eps * size(z)
-        return (count == 0) | (far & (change < _CONTRACTION * before) & (count < _MOST_REPEATS))
+        return (count == 0) | (far & (change < _CONTRACTION * before) & (count < _MAX_REPEATS))
 
     def renew(state):
         z, _, before, count = state
@@ -188,7 +188,7 @@ def _newton(function, jacobian, z, n: int):
 
     def is_running(state):
         z, change, _, count = state
-        return (change > eps**0.75 * size(z)) & (count < _MOST_JACOBIANS)
+        return (change > eps**0.75 * size(z)) & (count < _MAX_JACOBIANS)
 
     # A change that is not known yet is infinite, so that both loops begin.
     unknown = jnp.asarray(jnp.inf, z.dtype)

@@ -31,9 +31,9 @@ def is_definite(matrix: Float[Array, "n n"], factor: Float[Array, "n n"]) -> Boo
 
 
 def _has_pivots(factor, diagonal):
-    least = 16 * float(jnp.finfo(factor.dtype).eps)
+    minimum = 16 * float(jnp.finfo(factor.dtype).eps)
     pivots = jnp.diagonal(factor)
-    return jnp.all(pivots * pivots > least * diagonal)
+    return jnp.all(pivots * pivots > minimum * diagonal)
 
 
 def solve_lower(

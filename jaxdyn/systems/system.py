@@ -343,10 +343,10 @@ def check_mass_matrix(mass, name: str, q, t) -> None:
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(mass / np.outer(scale, scale))
     # Eigenvalues of a matrix with unit diagonal have rounding errors of about n eps.
-    least = 10 * len(mass) * float(np.finfo(np.asarray(q).dtype).eps)
-    if values[0] > least:
+    minimum = 10 * len(mass) * float(np.finfo(np.asarray(q).dtype).eps)
+    if values[0] > minimum:
         return
-    rank = int(np.sum(np.abs(values) > least))
+    rank = int(np.sum(np.abs(values) > minimum))
     if rank == len(mass):
         raise ValueError(
             f"the mass matrix of this {name} is not positive definite at {place}: eigenvalues "

@@ -22,7 +22,7 @@ else:
 
 logger = logging.getLogger("jaxdyn")
 WINDOW = 4  # tasks per worker, running or waiting: enough that it never idles, few enough that memory stays flat
-LEAST_WINDOW = 16
+MIN_WINDOW = 16
 AHEAD = 8  # windows that tasks may run ahead of an unfinished one, whose place in the order their results wait for
 
 
@@ -184,7 +184,7 @@ class _Window:
         """Fill the window when half of it is empty: a call of the scheduler costs more than a task."""
         if time.monotonic() - self._counted > 1.0:
             self._workers, self._counted = self._cluster.workers, time.monotonic()
-        size = max(LEAST_WINDOW, WINDOW * self._workers)
+        size = max(MIN_WINDOW, WINDOW * self._workers)
         if len(self.waiting) > size // 2:
             return
         room = min(size - len(self.waiting), self._next + AHEAD * size - self._taken)

@@ -357,8 +357,8 @@ def test_another_way_is_taken_without_a_word(caplog):
         computed = backend.kernel(lambda _, x: jnp.sort(x), fallback=lambda _, x: jnp.zeros(3))((), normal(3))
     assert not computed.any() and not caplog.records
     # Three sines and three products.
-    assert "more than 5 operations" in str(program_of(lambda _, x: jnp.sin(x) * x, (), (), (normal(3),), most=5)[1])
-    assert not isinstance(program_of(lambda _, x: jnp.sin(x) * x, (), (), (normal(3),), most=9)[1], str)
+    assert "more than 5 operations" in str(program_of(lambda _, x: jnp.sin(x) * x, (), (), (normal(3),), maximum=5)[1])
+    assert not isinstance(program_of(lambda _, x: jnp.sin(x) * x, (), (), (normal(3),), maximum=9)[1], str)
 
 
 # --- derivatives ---

@@ -143,7 +143,7 @@ def test_weights_that_have_not_settled_are_said(monkeypatch):
     unloaded = identify.Log(unloaded.t, unloaded.q, unloaded.v, unloaded.a, unloaded.tau + noise)
     found = identify.fit_gains(model, unloaded, loaded, MASS, CENTRE, v_s=0.05)
     assert bool(found.success)
-    for limits in ({"MOST_ROUNDS": 1}, {"MOST_ROUNDS": 2, "_STEPS": 1}):
+    for limits in ({"MAX_ROUNDS": 1}, {"MAX_ROUNDS": 2, "_STEPS": 1}):
         with monkeypatch.context() as patch:
             for name, least in limits.items():
                 patch.setattr(f"jaxdyn.identify.payloads.{name}", least)

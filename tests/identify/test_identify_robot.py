@@ -202,7 +202,7 @@ def test_loads_that_have_not_settled_are_said(truth, monkeypatch):
     loaded[10:20] += np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
     held = measured(arm(), motion(3), loaded, noise=0.02, seed=3)
     assert bool(identify.fit_payload(model, log(1), held, robot=fit).success)
-    monkeypatch.setattr("jaxdyn.identify.payloads.MOST_ROUNDS", 1)
+    monkeypatch.setattr("jaxdyn.identify.payloads.MAX_ROUNDS", 1)
     short = identify.fit_payload(model, log(1), held, robot=fit)
     assert short.result is jd.RESULTS.max_steps_reached and "NOT CONVERGED" in payload_text(short)
     basic, extra, where = split_terms(terms, 2)
@@ -290,11 +290,11 @@ def test_clear_improvements():
     """Half of the error everywhere is clear; a thousandth is too little, and four splits of six are not most of them."""
     before = np.ones((6, 3))
     after = np.stack([np.full(6, 0.5), np.full(6, 0.999), [0.1, 0.9, 0.9, 0.9, 1.1, 1.1]], axis=1)
-    assert improving_torques(before, after) == (0,) and improving_torques(before, after, least=0.0) == (0, 1)
+    assert improving_torques(before, after) == (0,) and improving_torques(before, after, minimum=0.0) == (0, 1)
     assert standard_error(np.array([1.0, 2.0, 3.0, 4.0])) == pytest.approx(np.sqrt(5 / 3) / 2)
     # Half of the sum, half of each torque: squares of 1 and 4 have the logarithms log 5 and log 2.
     assert log_errors(np.array([1.0, 4.0])) == pytest.approx((np.log(5) + np.log(2)) / 2)
-    assert is_clear(before, 0.9 * before) and not is_clear(before, 0.9 * before, least=0.2)
+    assert is_clear(before, 0.9 * before) and not is_clear(before, 0.9 * before, minimum=0.2)
     # One block of six gains much, and another loses a little: the mean gain is less than its standard error.
     assert not is_clear(before, np.array([0.1, 1.1, 1.0, 1.0, 1.0, 1.0])[:, None] * before)
 

@@ -64,6 +64,7 @@ q0, v0 = jd.scenes.hand_with_ball.start(twist=(0.0,) * 6)
 q_object, ts = q0[grasp.system.topology.q_slices[-1]], jnp.linspace(0.0, 0.01, 2)
 """,
         "dynamics.frame_acceleration": ARM,
+        "forces.external_wrenches": "a = jnp.zeros_like(v)",
         "grasp.hand_dynamics": MOTIONS,
         "grasp.hand_motions": MOTIONS,
         "identify.Measured": """

@@ -335,7 +335,7 @@ def test_records_hold_what_a_motion_says(body, rungs, records):
 
 
 def test_a_slow_run_is_timed_once(body, rungs):
-    (record,) = measure(body, rungs[:1], "float64", 1, rounds=2, most=0.0)
+    (record,) = measure(body, rungs[:1], "float64", 1, rounds=2, maximum=0.0)
     assert record.rounds == 1
     assert record.seconds_best == record.seconds_median > 0
 
@@ -399,7 +399,7 @@ def test_interleaved_drops_who_is_slow():
     def call(name):
         calls[name] += 1
 
-    times = time_alternately({name: lambda name=name: call(name) for name in calls}, 5, least=0.0, most=-1.0)
+    times = time_alternately({name: lambda name=name: call(name) for name in calls}, 5, minimum=0.0, maximum=-1.0)
     assert times["slow"]["rounds"] == times["fast"]["rounds"] == 3
     assert calls == {"slow": 5, "fast": 5}  # two to see how long it takes
     assert times["slow"]["best"] <= times["slow"]["median"]

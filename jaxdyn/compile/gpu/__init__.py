@@ -59,7 +59,7 @@ class _Kernel:
         function, registers, multiprocessors = driver().load(self.ptx, KERNEL, stream)
         self.entry.chunk = MAX_THREADS if registers <= MANY_REGISTERS else MAX_THREADS // 2
         # Small batches are spread over all multiprocessors.
-        self.entry.least = 32 * MIN_WARPS * multiprocessors
+        self.entry.minimum = 32 * MIN_WARPS * multiprocessors
         self.functions[device] = function
 
 

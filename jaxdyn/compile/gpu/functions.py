@@ -196,8 +196,8 @@ def _mantissa(x: Number) -> tuple[Number, Number]:
     """Number m between the root of a half and that of two, and k, with x = m 2^k for finite x above zero."""
     is_small = x < 2.0**-1022
     bits = is_small.select(x * 2.0**54, x).bits()
-    least = 0x3FE6A09E667F3BCD  # the bits of the root of a half
-    k = (bits - least).shift("ashr", 52)
+    minimum = 0x3FE6A09E667F3BCD  # the bits of the root of a half
+    k = (bits - minimum).shift("ashr", 52)
     m = (bits - k.shift("shl", 52)).from_bits()
     return m, k.convert("f8") - is_small.select(54.0, 0.0)
 

@@ -24,7 +24,7 @@ from jaxdyn.model.tree import Model, Topology, geometry
 
 # Common normals of nearly parallel lines are far away: lengths grow by 1/sin(alpha), and with their
 # squares the rounding errors of moments of inertia. Below this sine the shift stays general.
-LEAST_SINE = 0.2
+MIN_SINE = 0.2
 
 
 class PlaneAngle(NamedTuple):
@@ -176,12 +176,12 @@ def _decompose(pose, eps) -> Home:
         beside = np.hypot(p[0], p[1]) > reach
         phi = _plane_angle(p[0], p[1], eps) if beside else PlaneAngle(1.0, 0.0)
     along = phi.cos * p[0] + phi.sin * p[1], phi.cos * p[1] - phi.sin * p[0], p[2]  # in axes rotated by phi
-    if sine > LEAST_SINE:
+    if sine > MIN_SINE:
         # Feet of the common normal: p = e z + a x + d axis, with axis = (0, -sin alpha, cos alpha).
         d = length(-along[1] / alpha.sin)
         e, shift = length(along[2] - d * alpha.cos), np.array([length(along[0]), 0.0, 0.0])
     elif sine > eps:
-        # Nearly parallel axes: the foot of their common normal is far away (`LEAST_SINE`).
+        # Nearly parallel axes: the foot of their common normal is far away (`MIN_SINE`).
         shift = np.array([length(x) for x in along])
     else:
         e, shift = length(along[2]), np.array([length(along[0]), 0.0, 0.0])

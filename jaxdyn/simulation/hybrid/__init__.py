@@ -110,19 +110,19 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     mode = mode._replace(positive=bind(unknown)[2](q0, v0, ts[0]) > 0)
     if scene.constraints:
         start_ok = start_ok & consistent(scene.without_forces, q0, v0, ts[0])
-    y0, most, max_steps = {"q": q0, "v": v0, "slip": slip}, options.max_events, options.max_steps
+    y0, maximum, max_steps = {"q": q0, "v": v0, "slip": slip}, options.max_events, options.max_steps
     if stepsize is not None and not options.limit_is_given:
-        max_steps += SEARCH_STEPS * most
+        max_steps += SEARCH_STEPS * maximum
     system = ModalSystem(bind, elements, options.solver, y0)
     room = max_steps if stepsize is not None else min(max_steps, ROOM)
-    run: Any = HybridRun(system, mode, rtol, atol, stepsize, max_steps, most, room=room)
+    run: Any = HybridRun(system, mode, rtol, atol, stepsize, max_steps, maximum, room=room)
     # A custom rule for reverse mode admits no forward mode: these adjoints need the run without it.
     if isinstance(options.adjoint, (diffrax.ForwardMode, diffrax.DirectAdjoint)):
         run = run.direct
     rows, times, (end, records, begun) = run(y0, unknown, ts)
     # A save point at an event shows the state before it.
-    passed = jnp.sum(records.time[None, :most] < ts[:, None], 1)
-    modes = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:most]])[passed], begun.mode, records.mode)
+    passed = jnp.sum(records.time[None, :maximum] < ts[:, None], 1)
+    modes = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b[:maximum]])[passed], begun.mode, records.mode)
     first = {"q": q0, "v": v0, "slip": begun.slip}
     y = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rows)
     reached = good & jnp.isfinite(y["q"]).all(1) & jnp.isfinite(y["v"]).all(1)
@@ -147,9 +147,9 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     result = rank_code(scene, first_of(cases, end.result))
     # The end of a run is an input, which has derivatives; the time in the loop has none.
     time_reached = jnp.where(end.t >= ts[-1], ts[-1], end.t)
-    times = _times_of_rest(times, lax.stop_gradient(records.tail[:most]), ts[-1])
+    times = _times_of_rest(times, lax.stop_gradient(records.tail[:maximum]), ts[-1])
     touched = _impacts_at_start(scene, elements, q0, v0, ts[0], mode)
-    events = _events(elements, touched, ts[0], times, records.name[:most], good & start_ok)
+    events = _events(elements, touched, ts[0], times, records.name[:maximum], good & start_ok)
     rows, times = {"q": y["q"], "v": y["v"], **values}, (jnp.where(good, time_reached, ts[0]), events)
     rows, (time_reached, events) = invalidate_failures(rows, times, result, reached, (scene, control, numbers))
     stats = end.counts | {"time_reached": time_reached}
@@ -216,12 +216,12 @@ def _impacts_at_start(scene: Scene, elements, q, v, t, mode: Mode):
 
 def _events(elements, touched, start, times, index, good) -> Events:
     """Events of a run, with the impacts at its start in front; none of a start that is refused."""
-    most = index.shape[0]
+    maximum = index.shape[0]
     first = jnp.where(touched, jnp.arange(touched.shape[0], dtype=index.dtype) * len(KINDS), -1)
     index = jnp.concatenate([first, index])
     times = jnp.concatenate([jnp.where(touched, start, jnp.nan), times])
     # Stable: events keep their order in time, and empty places go behind them.
-    order = jnp.argsort(index < 0, stable=True)[:most]
+    order = jnp.argsort(index < 0, stable=True)[:maximum]
     index, times = index[order], times[order]
     return Events(jnp.where(good, times, jnp.nan), jnp.where(good, index, -1), elements.names)
 
@@ -287,13 +287,23 @@ class PiecewiseSystem(HybridSystem):
 
 
 def piecewise_motion(
-    system: PiecewiseSystem, y0, args, ts, rtol, atol, stepsize, max_steps: int, room: int, most: int, is_direct: bool
+    system: PiecewiseSystem,
+    y0,
+    args,
+    ts,
+    rtol,
+    atol,
+    stepsize,
+    max_steps: int,
+    room: int,
+    maximum: int,
+    is_direct: bool,
 ):
     """Rows of the state at ts[1:], and the end of the run.
 
     **Arguments:** `args` of the equations; `stepsize` (s), or None for adaptive steps; `max_steps`, without those that locate
-    events; `room` for steps between two events or save points in reverse mode; `most`, the number of events that derivatives go
-    through; `is_direct`: True for derivatives in forward mode too.
+    events; `room` for steps between two events or save points in reverse mode; `maximum`, the number of events that derivatives
+    go through; `is_direct`: True for derivatives in forward mode too.
     """
     unknown, flat = tuple(args or ()), ravel_pytree(y0)[0]
     none = jnp.zeros((0,), bool)
@@ -302,6 +312,6 @@ def piecewise_motion(
     rtol, atol = (jnp.asarray(x, flat.dtype) for x in (rtol, atol))
     mode = lax.stop_gradient(mode._replace(positive=values > 0))
     # Attempts that locate events do not count among the user's steps, so that there is room for both.
-    run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + SEARCH_STEPS * most, most, room=room)
+    run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + SEARCH_STEPS * maximum, maximum, room=room)
     rows, _, (end, _, _) = (run.direct if is_direct else run)(y0, unknown, ts)
     return rows, end

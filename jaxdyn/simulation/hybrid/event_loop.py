@@ -49,18 +49,18 @@ class Records(NamedTuple):
     slip: Array
 
 
-def no_records(elements: Elements, dtype, most: int) -> Records:
+def no_records(elements: Elements, dtype, maximum: int) -> Records:
     """Records before the first event."""
-    n, none = len(elements.each), jnp.zeros((most + 1,), jnp.int32)
-    flags, slip = jnp.zeros((most + 1, n), bool), jnp.zeros((most + 1, n, 2), dtype)
-    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool), slip[..., 0], slip[..., 0])
+    n, none = len(elements.each), jnp.zeros((maximum + 1,), jnp.int32)
+    flags, slip = jnp.zeros((maximum + 1, n), bool), jnp.zeros((maximum + 1, n, 2), dtype)
+    mode = Mode(flags, flags, flags, jnp.zeros((maximum + 1, elements.switches), bool), slip[..., 0], slip[..., 0])
     impact = Collision(mode, slip, slip[..., 0], flags, flags)
-    times = jnp.full((most + 1,), jnp.nan, dtype)
+    times = jnp.full((maximum + 1,), jnp.nan, dtype)
     return Records(times, jnp.zeros_like(times), none - 1, none - 1, impact, mode, slip)
 
 
 def record_elements(
-    elements: Elements, t, before: Mode, change: Transition, hit, happens, rows: Records, count, most: int
+    elements: Elements, t, before: Mode, change: Transition, hit, happens, rows: Records, count, maximum: int
 ):
     """Records with a row for each element that an event has changed, and their number."""
     mode, number = change.mode, jnp.arange(len(elements.each), dtype=jnp.int32)
@@ -79,7 +79,7 @@ def record_elements(
     rank = jnp.cumsum(changed & ~leads, dtype=jnp.int32) + leads.any().astype(jnp.int32) - 1
     rank = jnp.where(leads, jnp.zeros_like(rank), rank)
     # A scatter needs a place for what is not kept too: the spare last row.
-    places = jnp.where(changed & (count + rank < most), count + rank, most)
+    places = jnp.where(changed & (count + rank < maximum), count + rank, maximum)
 
     def by_row(first, others):
         """For the leading element the one, for the others the other."""
@@ -99,11 +99,11 @@ def record_elements(
     return rows, count + jnp.sum(changed, dtype=jnp.int32)
 
 
-def record_switches(elements: Elements, t, count, mode: Mode, records: Records, switched, slip, most: int):
+def record_switches(elements: Elements, t, count, mode: Mode, records: Records, switched, slip, maximum: int):
     """Records with a row for each switching function that changed its sign, and their number."""
     # Functions that switch together take consecutive rows.
     index = jnp.cumsum(switched, dtype=jnp.int32) - 1
-    places = jnp.where(switched, jnp.minimum(count + index, most), most)
+    places = jnp.where(switched, jnp.minimum(count + index, maximum), maximum)
     # They change one after the other: the mode of a row has the changes of the rows before it and its own.
     earlier = switched[None] & (index[None] <= index[:, None])
     k, first = elements.switches, len(elements.each)
@@ -123,13 +123,13 @@ def record_switches(elements: Elements, t, count, mode: Mode, records: Records, 
     return rows, count + jnp.sum(switched, dtype=jnp.int32)
 
 
-def chatters(elements: Elements, t, usual, count, records: Records, switched, most: int):
+def chatters(elements: Elements, t, usual, count, records: Records, switched, maximum: int):
     """True if a switching function changes back at once: on both sides of its zero the force drives the motion onto it."""
-    last = jnp.maximum(jnp.minimum(count, most) - 1, 0)
+    last = jnp.maximum(jnp.minimum(count, maximum) - 1, 0)
     names = jnp.arange(elements.switches, dtype=jnp.int32) + len(elements.each) * len(KINDS)
     # Two events of one function within the rounding of the time: the motion cannot leave the zero between them.
-    least = 64 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(t), usual)
-    return ((names == records.name[last]) & switched).any() & (t - records.time[last] <= least)
+    minimum = 64 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(t), usual)
+    return ((names == records.name[last]) & switched).any() & (t - records.time[last] <= minimum)
 
 
 class RunState(NamedTuple):
@@ -164,10 +164,10 @@ def _begin_mode(system: HybridSystem, args, t, y):
     return y, plan.first_rate(args, t, y), plan.guards_of(args, t, y)[0]
 
 
-def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize, max_steps: int, most: int):
+def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize, max_steps: int, maximum: int):
     """Rows of the state at ts[1:], the end, the records, and the transition at the start.
 
-    `y0` (m,), flat, and `mode`: a first guess; `stepsize` (s), or None for adaptive steps. `most`: number of events.
+    `y0` (m,), flat, and `mode`: a first guess; `stepsize` (s), or None for adaptive steps. `maximum`: number of events.
     """
     elements, plan = system.elements, system.plan
     hit = jnp.zeros((CHANNELS * len(elements.each) + elements.switches,), bool)
@@ -191,12 +191,12 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
 
     def body(run: RunState) -> RunState:
         happens = run.steps.state.search.hit.any()
-        pass_event = partial(_pass_event, system, unknown, most, stepsize is not None, atol)
+        pass_event = partial(_pass_event, system, unknown, maximum, stepsize is not None, atol)
         run = cond(happens, pass_event, lambda run: run, run)
         steps = driver.run_to_event(plan, control, max_steps, (), (unknown, run.mode), limits, Given(ts), run.steps)
         return run._replace(steps=steps)
 
-    run = RunState(steps, begun.mode, no_records(elements, y0.dtype, most), jnp.zeros((), jnp.int32), result)
+    run = RunState(steps, begun.mode, no_records(elements, y0.dtype, maximum), jnp.zeros((), jnp.int32), result)
     run = while_loop(is_running, body, run)
     state = run.steps.state
     # Friction that leaves no forces grows without bound before.
@@ -211,7 +211,7 @@ def _cases(change: Transition) -> list[tuple[Array, Any]]:
     return [(change.paradox, RESULTS.painleve_paradox), (~change.settled, RESULTS.no_contact_mode)]
 
 
-def _pass_event(system: HybridSystem, unknown, most: int, is_fixed_length: bool, atol, run: RunState) -> RunState:
+def _pass_event(system: HybridSystem, unknown, maximum: int, is_fixed_length: bool, atol, run: RunState) -> RunState:
     """State in the mode behind an event, and the records with it; unchanged where there is none."""
     elements, before, state, records = system.elements, run.mode, run.steps.state, run.records
     hit, search = state.search.hit, state.search
@@ -225,19 +225,19 @@ def _pass_event(system: HybridSystem, unknown, most: int, is_fixed_length: bool,
     if elements.switches:
         # Steps that go across the roots have no records.
         rows, count = record_switches(
-            elements, state.t, count, before, records, switched & happens & ~search.loose, change.slip, most
+            elements, state.t, count, before, records, switched & happens & ~search.loose, change.slip, maximum
         )
     if elements.each:
-        rows, count = record_elements(elements, state.t, before, change, by_element, happens, rows, count, most)
+        rows, count = record_elements(elements, state.t, before, change, by_element, happens, rows, count, maximum)
     # With switching functions alone, a motion without room for its events continues: it loses its derivatives.
-    crowded, loose = (count > most) & bool(elements.each), search.loose
+    crowded, loose = (count > maximum) & bool(elements.each), search.loose
     if elements.switches:
-        is_chatter = chatters(elements, state.t, search.usual, run.count, records, switched, most) & ~loose
+        is_chatter = chatters(elements, state.t, search.usual, run.count, records, switched, maximum) & ~loose
         # Steps of fixed length go across the zero from then on.
         begins = is_chatter & bool(is_fixed_length and not elements.each)
         crowded = crowded | (is_chatter & ~begins)
         # More events than there is room for: the replay then gives NaN for derivatives, which this motion lacks.
-        count = jnp.where(begins, most + 1, count)
+        count = jnp.where(begins, maximum + 1, count)
         loose = loose | begins
     # First, because it is the reason why no mode was found.
     cases = [
@@ -268,14 +268,14 @@ class HybridRun(Integrator):
     atol: Any
     stepsize: Any  # None for adaptive steps
     max_steps: int = eqx.field(static=True)
-    most: int = eqx.field(static=True)  # events
+    maximum: int = eqx.field(static=True)  # events
 
     def values(self, inputs, room):
         y0, unknown, ts = inputs
-        steps = self.rtol, self.atol, self.stepsize, self.max_steps, self.most
+        steps = self.rtol, self.atol, self.stepsize, self.max_steps, self.maximum
         rows, end, records, begun = run_events(self.system, unknown, ts, ravel_pytree(y0)[0], self.mode, *steps)
         facts = end, records, begun
-        return (jax.vmap(self.system.plan.structure)(rows), records.time[: self.most], facts), facts
+        return (jax.vmap(self.system.plan.structure)(rows), records.time[: self.maximum], facts), facts
 
     def replay(self, history, inputs, direct):
         end, records, begun = history
@@ -284,19 +284,19 @@ class HybridRun(Integrator):
     def weights(self, inputs, gradients, history):
         y0, _, ts = inputs
         rows, times, _ = gradients
-        times = jnp.zeros((self.most,), ts.dtype) if times is None else times
+        times = jnp.zeros((self.maximum,), ts.dtype) if times is None else times
         # Events that did not happen have no time.
-        times = jnp.where(history[1].name[: self.most] < 0, jnp.zeros_like(times), times)
+        times = jnp.where(history[1].name[: self.maximum] < 0, jnp.zeros_like(times), times)
         return zeros_or(rows, y0, ts.shape[0] - 1), times
 
 
 def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     """Rows at ts[1:] and times of events by replay in the modes that are known; `direct`: differentiable in both modes."""
     system, (y0, unknown, ts) = run.system, inputs
-    plan, saves, most = system.plan._replace(guards=None), ts.shape[0] - 1, run.most
-    happened = records.name[:most] >= 0
-    known_times = jnp.concatenate([ts[1:], jnp.where(happened, records.time[:most], jnp.inf)])
-    is_event = jnp.arange(saves + most) >= saves
+    plan, saves, maximum = system.plan._replace(guards=None), ts.shape[0] - 1, run.maximum
+    happened = records.name[:maximum] >= 0
+    known_times = jnp.concatenate([ts[1:], jnp.where(happened, records.time[:maximum], jnp.inf)])
+    is_event = jnp.arange(saves + maximum) >= saves
     order = jnp.lexsort((is_event, lax.stop_gradient(known_times)))  # a save point at an event is before it
     part_run = LibraryRun(
         plan, step_control(plan.solver(), run.stepsize), run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room
@@ -305,12 +305,12 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
 
     def part_or_none(carry, at):
         # There is room for more events than happened: the rest is skipped.
-        happens = ~is_event[at] | happened[jnp.clip(at - saves, 0, most - 1)]
+        happens = ~is_event[at] | happened[jnp.clip(at - saves, 0, maximum - 1)]
         return cond(happens, part, lambda carry, at: (carry, carry[:2]), carry, at)
 
     def part(carry, at):
         t, y, mode = carry
-        event, place = is_event[at], jnp.clip(at - saves, 0, most - 1)
+        event, place = is_event[at], jnp.clip(at - saves, 0, maximum - 1)
         record = jax.tree.map(lambda x: x[place], records)
         # The derivative of an event's time enters by `_cross`: here the time is a constant.
         until = jnp.where(event, lax.stop_gradient(record.time), ts[1:][jnp.clip(at, 0, saves - 1)])
@@ -335,7 +335,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     # The inverse permutation: save points first, then events.
     back = jnp.argsort(order)
     # A motion that continued beyond the events that there was room for has no derivative here.
-    rows = rows * jnp.where((end.count > most) & (end.result != RESULTS.too_many_events), jnp.nan, 1.0).astype(
+    rows = rows * jnp.where((end.count > maximum) & (end.result != RESULTS.too_many_events), jnp.nan, 1.0).astype(
         rows.dtype
     )
     return jax.vmap(plan.structure)(rows[back[:saves]]), times[back[saves:]]

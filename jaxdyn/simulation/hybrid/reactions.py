@@ -75,9 +75,9 @@ def directions(scene: Scene, elements: Elements, mode: Mode, slip, reference) ->
     for i, one in enumerate(elements.each):
         w, s = slip[i], reference[i]
         # A velocity that may be the rounding of others has no direction of its own: the reference is kept.
-        least = 0.0 if one.smooth else tolerance(w.dtype)
+        minimum = 0.0 if one.smooth else tolerance(w.dtype)
         square = jnp.sum(w * w)
-        is_sliding = (square > least**2) & (mode.creep[i] <= 0)
+        is_sliding = (square > minimum**2) & (mode.creep[i] <= 0)
         # The square root has an infinite derivative at zero, which a mask behind it would turn into NaN.
         length = jnp.sqrt(jnp.where(is_sliding, square, jnp.ones_like(square)))
         if one.smooth:

@@ -165,11 +165,11 @@ class ModalSystem(HybridSystem):
         mode = mode._replace(positive=mode.positive ^ switched)
         holding, speed, size = kernel(self._friction, derivative=False)(unknown, mode, slip, t, q, v)
         # Sliding that is slower than the error of its velocity has ended: its direction is not known.
-        least = jnp.asarray(2 * tolerance(q.dtype), q.dtype)
-        least = least if atol is None else jnp.maximum(least, _STOPPED * atol)
+        minimum = jnp.asarray(2 * tolerance(q.dtype), q.dtype)
+        minimum = minimum if atol is None else jnp.maximum(minimum, _STOPPED * atol)
         is_impact = (jnp.asarray(self.elements.opening) & hit[:, 0] & ~mode.closed).any()
         # In a fixed direction it ends where it turns round, with what is left across.
-        slow = least * (1 + size)
+        slow = minimum * (1 + size)
         ends = (speed <= slow) | (hit[:, 1] & (mode.creep > 0) & (speed < mode.creep / 2))
         stopped = jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & ends & ~is_impact
         before = mode.closed
@@ -192,8 +192,8 @@ class ModalSystem(HybridSystem):
         """Transition from a first guess of the mode; `begins` (n,) marks elements that slide from rest, and speeds up to `slow`
         (n,) count as zero."""
         elements, n = self.elements, len(self.elements.each)
-        least = tolerance(q.dtype) * (1 + jnp.max(jnp.abs(q)))
-        height = 4 * least if atol is None else jnp.maximum(4 * least, atol)
+        minimum = tolerance(q.dtype) * (1 + jnp.max(jnp.abs(q)))
+        height = 4 * minimum if atol is None else jnp.maximum(4 * minimum, atol)
 
         def attempt(carry):
             tries, guess, (rebound, held, stopped), last, busy = carry
@@ -246,7 +246,7 @@ class ModalSystem(HybridSystem):
         none, no, zero = jnp.zeros((n,), bool), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         mode = mode._replace(excess=jnp.zeros((n,), q.dtype), creep=jnp.zeros((n,), q.dtype))
         # As far as the square of the speed is below the tolerance, the direction of sliding may lag behind.
-        fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
+        fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, minimum))
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no, jnp.zeros((), q.dtype))
         return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no & happens))[3]
@@ -303,14 +303,14 @@ class ModalSystem(HybridSystem):
         free, rates = free_motion(scene, terms, generalized_force(q, v, t), q, v, t)
         # Sizes of the terms that cancel in the rates.
         sizes = self._speeds(terms, terms.metric.unwhiten(free)) + jnp.max(jnp.abs(terms.row.gamma))
-        least = 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
-        rests = self._touches(scene, q, t) & (jnp.abs(rates_of(elements, terms.row.velocity)[0]) <= least)
+        minimum = 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
+        rests = self._touches(scene, q, t) & (jnp.abs(rates_of(elements, terms.row.velocity)[0]) <= minimum)
         speed, _ = length(terms.slip)
         size = jnp.max(jnp.abs(rates)) / jnp.max(terms.gram.squares)
         loads = normal_loads(scene, elements, q, v, t)
         # A contact in flight has no force, and an element that slides does not stick.
         problem = Problem(
-            terms.gram, rates, of.sliding, of.static, loads, rests, speed <= least, zero > 0, zero > 0, size, sizes
+            terms.gram, rates, of.sliding, of.static, loads, rests, speed <= minimum, zero > 0, zero > 0, size, sizes
         )  # fmt: skip
         return problem, directions(scene, elements, mode, terms.slip, slip)
 

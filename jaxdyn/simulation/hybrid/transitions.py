@@ -206,11 +206,11 @@ def _change_first(elements: Elements, _, problem: Problem, choice: Choice, __) -
     moves = (jnp.sum(turned * slip, 1) < 1 - _ANGLE) & ~wrong.any()
     slip = jnp.where(leaves[:, None], against, jnp.where(moves[:, None], turned, slip))
     changes = changes + jnp.where(wrong.any(), _WEIGHT, 1).astype(jnp.int32)
-    done = ~(wrong.any() | moves.any()) | (changes >= _WEIGHT * most_changes(elements))
+    done = ~(wrong.any() | moves.any()) | (changes >= _WEIGHT * max_changes(elements))
     return Iteration(Choice(changed, slip, changes, wrong.any(), done), ~choice.done, ~done)
 
 
-def most_changes(elements: Elements) -> int:
+def max_changes(elements: Elements) -> int:
     """Number of changes after which no mode was found."""
     # An element changes a few times at most: more changes are a cycle.
     return 8 * len(elements.each) + 16
@@ -268,8 +268,8 @@ def find_jams(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[
     depends = depends_on_others(elements, problem.gram, mode._replace(stick=mode.stick | rests))
     speed, _ = length(rates_of(elements, rates)[1])
     sizes = problem.gram.sizes(reaction.along) + jnp.abs(problem.free)
-    least = _STILL * jnp.max(rates_of(elements, sizes)[1], 1) + tolerance(speed.dtype) * problem.rate
-    return rests & ~mode.stick & depends & (speed <= least), reaction, rates
+    minimum = _STILL * jnp.max(rates_of(elements, sizes)[1], 1) + tolerance(speed.dtype) * problem.rate
+    return rests & ~mode.stick & depends & (speed <= minimum), reaction, rates
 
 
 def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode:

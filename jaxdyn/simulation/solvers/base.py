@@ -191,7 +191,7 @@ ALLOWED = 0.1
 _NO_MOTION = ("frame", "held", "work", "slip")
 # Control of the step length by the last error alone (Hairer, Norsett & Wanner 1993, section II.4): the next step aims at an error
 # of _SAFETY^order of the tolerance, and is at most _MOST_FACTOR times as long, at least _LEAST_FACTOR times.
-_SAFETY, _LEAST_FACTOR, _MOST_FACTOR = 0.9, 0.2, 10.0
+_SAFETY, _MIN_FACTOR, _MAX_FACTOR = 0.9, 0.2, 10.0
 
 
 class NextStep(NamedTuple):
@@ -199,7 +199,7 @@ class NextStep(NamedTuple):
 
     kept: Array
     length: Array
-    at_least: Array
+    is_shortest: Array
     failed: Array
 
 
@@ -218,19 +218,19 @@ def step_factor(size, order, kept):
     """Ratio of the next step length to the last one, for a scaled error `size` of the given order."""
     factor = _SAFETY * (1 / size) ** (1 / order)
     # An error of NaN is one of infinity: the step is refused and shortened as far as one refusal may shorten it.
-    factor = jnp.where(jnp.isnan(factor), _LEAST_FACTOR, factor)
+    factor = jnp.where(jnp.isnan(factor), _MIN_FACTOR, factor)
     # A step that was kept is not followed by a shorter one, nor a refused one by a longer one.
-    return jnp.clip(factor, jnp.where(kept, 1.0, _LEAST_FACTOR), jnp.where(kept, _MOST_FACTOR, _SAFETY))
+    return jnp.clip(factor, jnp.where(kept, 1.0, _MIN_FACTOR), jnp.where(kept, _MAX_FACTOR, _SAFETY))
 
 
-def next_step(size, order, length, at_least, least) -> NextStep:
-    """Decide about a step of this length and scaled error; one of the least length (`at_least`) is kept whatever its error."""
-    kept = (size < 1) | at_least
+def next_step(size, order, length, is_shortest, minimum) -> NextStep:
+    """Decide about a step of this length and scaled error; one of the least length (`is_shortest`) is kept whatever its error."""
+    kept = (size < 1) | is_shortest
     factor = step_factor(size, order, kept)
     following = length * factor.astype(length.dtype)
-    failed = following < least
-    following = jnp.where(at_least & (factor == 1), least, following)
-    return NextStep(kept, jnp.maximum(following, least), following <= least, failed)
+    failed = following < minimum
+    following = jnp.where(is_shortest & (factor == 1), minimum, following)
+    return NextStep(kept, jnp.maximum(following, minimum), following <= minimum, failed)
 
 
 class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
@@ -246,7 +246,7 @@ class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
     rtol: Any
     atol: Any
     norm: Callable
-    least: Any
+    minimum: Any
 
     def wrap(self, direction):
         """Control of a run in a direction: forwards."""
@@ -256,7 +256,7 @@ class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
         """End of the first step, and whether it is the least one."""
         if dt0 is None:
             dt0 = first_step(terms, t0, t1, y0, args, error_order, self.rtol, self.atol, self.norm)
-        first = jnp.where(jnp.isfinite(dt0), jnp.minimum(t0 + jnp.maximum(dt0, self.least), t1), t1)
+        first = jnp.where(jnp.isfinite(dt0), jnp.minimum(t0 + jnp.maximum(dt0, self.minimum), t1), t1)
         return first, jnp.asarray(False)
 
     def adapt_step_size(self, t0, t1, y0: Any, y1_candidate, args, y_error, error_order: Any, controller_state):
@@ -264,15 +264,15 @@ class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
         # Steps are constants to derivatives.
         given = jax.lax.stop_gradient((y0, y1_candidate, y_error, self.rtol, self.atol))
         size, length = error_size(self.norm, *given), jnp.asarray(t1 - t0)
-        least = jnp.asarray(least_step(t0, jnp.asarray(self.least)), length.dtype)
-        kept, length, at_least, failed = next_step(size, error_order, length, controller_state, least)
+        minimum = jnp.asarray(min_step(t0, jnp.asarray(self.minimum)), length.dtype)
+        kept, length, is_shortest, failed = next_step(size, error_order, length, controller_state, minimum)
         start = jnp.where(kept, t1, t0)
         codes: Any = diffrax.RESULTS
         result = codes.where(failed, codes.dt_min_reached, codes.successful)
-        return kept, start, start + length, False, at_least, result
+        return kept, start, start + length, False, is_shortest, result
 
 
-def least_step(t0, at_end):
+def min_step(t0, at_end):
     """Least length of a step from t0, where `at_end` is that at the end of the run."""
     eps = float(jnp.finfo(jnp.result_type(t0)).eps)
     return jnp.clip(16 * eps * jnp.abs(t0), eps * at_end, at_end)

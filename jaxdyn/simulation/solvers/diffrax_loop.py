@@ -193,8 +193,8 @@ def _record(inputs, given: DiffraxRun, room):
 def _repeat(given: DiffraxRun, controller, end):
     """Options of a run that repeats steps, with the state at the time `end` if that is the time of an event."""
     end = jax.lax.stop_gradient(end) if _is_located(given.event) else None
-    meter, most = diffrax.NoProgressMeter(), controller.ends.shape[0]
-    return given._replace(controller=controller, max_steps=most, progress=meter, event=None, end=end)
+    meter, maximum = diffrax.NoProgressMeter(), controller.ends.shape[0]
+    return given._replace(controller=controller, max_steps=maximum, progress=meter, event=None, end=end)
 
 
 class _GivenSteps(diffrax.AbstractStepSizeController):
@@ -284,11 +284,11 @@ class GuardedSolver(Wrapped):
         start, end, info, arrays = jax.lax.stop_gradient((t0, t1, dense_info, arrays))
         dense, args = self.interpolation_cls(t0=start, t1=end, **info), eqx.combine(arrays, rest_of_args)
 
-        def least(fraction):
+        def minimum(fraction):
             t = start + fraction * (end - start)
             return jnp.min(self.guards(t, dense.evaluate(t), args)[0])
 
-        passed = (jax.vmap(least)(jnp.asarray(_FRACTIONS, jnp.result_type(t0))) < 0).any()
+        passed = (jax.vmap(minimum)(jnp.asarray(_FRACTIONS, jnp.result_type(t0))) < 0).any()
         mark = jnp.where(passed, -1.0, 1.0).astype(y1[WITHIN].dtype)
         return y1 | {WITHIN: mark}, error, dense_info, state, result
 
@@ -301,11 +301,11 @@ def event_of(quality, guards, t0, y0, args) -> diffrax.Event | None:
 
     def condition(start, t, y, args, **_):
         # One event for all conditions: the first one that is violated ends the run.
-        least = jnp.minimum(jnp.min(guards(t, y, args)[0]), y[WITHIN])
+        minimum = jnp.minimum(jnp.min(guards(t, y, args)[0]), y[WITHIN])
         if quality is not None:
             # A run has one event: a basis that has become singular counts as a violation, whatever the allowances.
-            least = jnp.where(quality(t, y, args) * start > 0, least, -jnp.ones_like(least))
-        return least.astype(float)  # the dtype of diffrax's own branches
+            minimum = jnp.where(quality(t, y, args) * start > 0, minimum, -jnp.ones_like(minimum))
+        return minimum.astype(float)  # the dtype of diffrax's own branches
 
     eps = float(jnp.finfo(t0.dtype).eps)
     # A traced value must be a leaf of the event: reverse mode refuses one that a function captures.

@@ -30,7 +30,7 @@ from jaxdyn.simulation.solvers.base import (
     add_error,
     error_size,
     first_step,
-    least_step,
+    min_step,
     next_step,
     no_sums,
     too_coarse,
@@ -74,7 +74,7 @@ class Limits(NamedTuple):
     start: Array
     end: Array
     floor: Array
-    least_at_end: Array
+    min_at_end: Array
     steps: Array
     rtol: Array
     atol: Array
@@ -88,7 +88,7 @@ class State(NamedTuple):
     t_next: Array
     y: Array
     rate: Array
-    at_least: Array  # true for a step of the least length, which is kept whatever its error
+    is_shortest: Array  # true for a step of the least length, which is kept whatever its error
     tried: Array  # steps
     accepted: Array  # steps
     failed: Array
@@ -115,13 +115,13 @@ def begin(plan: Plan, control, args, ts, y0, rtol, atol, stepsize, records=()) -
     steps = none
     if not isinstance(control, AdaptiveSteps):
         length, steps = stepsize, number_of_steps(start, end, stepsize)
-    least_at_end = 16 * eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
-    limits = Limits(start, end, floor, least_at_end, steps, rtol, atol, y0)
+    min_at_end = 16 * eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
+    limits = Limits(start, end, floor, min_at_end, steps, rtol, atol, y0)
     search = None if plan.guards is None else Search.begin(values, values < -levels, jnp.asarray(length, ts.dtype))
     sums = no_sums(plan.structure(y0))
     if isinstance(control, AdaptiveSteps):
         # A replay of a motion with events may be as short as the rounding of their times.
-        length = jnp.maximum(length, least_step(start, least_at_end))
+        length = jnp.maximum(length, min_step(start, min_at_end))
     t_next = start + length
     t_next = jnp.where(t_next > floor, end, t_next)
     # What is not reached stays infinite, which tells it from rows that are computed.
@@ -208,7 +208,7 @@ def _accept(plan: Plan, control, args, limits: Limits, state: State, active, ste
         if_active(jnp.minimum(after, limits.end), state.t_next),
         jnp.where(kept, step.projected, state.y),
         jnp.where(kept, step.rate, state.rate),
-        decided.at_least,
+        decided.is_shortest,
         state.tried + one,
         state.accepted + kept.astype(jnp.int32),
         state.failed | (decided.failed & active),
@@ -242,9 +242,9 @@ def _search(
     )
     after = after if is_adaptive else after._replace(usual=search.usual)
     # Steps that an event has cut may be shorter than the least one of the control.
-    at_least, failed = decided.at_least & ~after.locating & ~located, decided.failed | (not is_adaptive)
+    is_shortest, failed = decided.is_shortest & ~after.locating & ~located, decided.failed | (not is_adaptive)
     usual = jnp.where(located, _AFTER_EVENT * after.usual, decided.length)
-    return NextStep(kept, jnp.where(after.locating, length, usual), at_least, failed & ~good), after
+    return NextStep(kept, jnp.where(after.locating, length, usual), is_shortest, failed & ~good), after
 
 
 def _grid_point(limits: Limits, number):
@@ -269,11 +269,11 @@ def _begin(plan: Plan, control, args, t0, t1, y, rtol, atol):
 def _control_step(plan: Plan, control, limits: Limits, state: State, t1, step: Step) -> NextStep:
     """Decide whether a step is kept, and the length of the next one."""
     if not isinstance(control, AdaptiveSteps):
-        return NextStep(jnp.asarray(True), limits.end - limits.start, state.at_least, jnp.asarray(False))
+        return NextStep(jnp.asarray(True), limits.end - limits.start, state.is_shortest, jnp.asarray(False))
     before, after, error = (plan.structure(x) for x in (state.y, step.projected, step.error))
     size = error_size(control.size, before, after, error, limits.rtol, limits.atol)
-    least = least_step(state.t, limits.least_at_end)
-    decided = next_step(size, control.order, t1 - state.t, state.at_least, least)
+    minimum = min_step(state.t, limits.min_at_end)
+    decided = next_step(size, control.order, t1 - state.t, state.is_shortest, minimum)
     # Behind the end there is no step that could be too short.
     return decided._replace(failed=decided.failed & ~(decided.kept & (t1 >= limits.end)))
 
@@ -401,14 +401,14 @@ class LibraryRun(Integrator):
     def values(self, inputs, room):
         y0, args, ts = inputs
         plan, control, start = self.plan, self.control, ravel_pytree(y0)[0]
-        most = self.max_steps if room is None else room
+        maximum = self.max_steps if room is None else room
         # The history of one step that is kept in any case follows from the inputs: where reverse mode computes a run again for
         # its history alone, this one is left out.
         is_one_step = room == 1 and plan.quality is plan.guards is None and isinstance(control, FixedSteps)
-        history = None if room is None or is_one_step else reverse.blank(start, ts[0], most)
+        history = None if room is None or is_one_step else reverse.blank(start, ts[0], maximum)
         records, strides = ((), ()) if history is None else (history.rows, history.strides)
         limits, carry = begin(plan, control, args, ts, start, self.rtol, self.atol, self.stepsize, records)
-        state, _, rows, records = run_to_event(plan, control, most, strides, args, limits, Given(ts), carry)
+        state, _, rows, records = run_to_event(plan, control, maximum, strides, args, limits, Given(ts), carry)
         if history is not None:
             states, times, kept = records
             history = reverse.History(states, times, kept, state.tried)

@@ -96,7 +96,7 @@ class Point(NamedTuple):
     levels: Array
 
 
-def _least_of_parabola(left: Point, middle: Point, right: Point) -> Array:
+def _minimum_of_parabola(left: Point, middle: Point, right: Point) -> Array:
     """Fraction of a step at which a guard is predicted to be least, of the guard that is then the lowest in its own size.
 
     By parabolas through three points; between the last two points where no guard has its least value within.
@@ -110,10 +110,10 @@ def _least_of_parabola(left: Point, middle: Point, right: Point) -> Array:
     # The vertex, from the middle of the first interval, where the slope is `first`.
     fraction = (left.fraction + middle.fraction) / 2 - first / (2 * safe)
     within = is_convex & (fraction > left.fraction) & (fraction < right.fraction)
-    least = middle.values + (fraction - middle.fraction) * (first + (fraction - left.fraction) * safe)
+    minimum = middle.values + (fraction - middle.fraction) * (first + (fraction - left.fraction) * safe)
     size = jnp.maximum(jnp.maximum(jnp.abs(left.values), jnp.abs(right.values)), tiny)
-    least = jnp.where(within, least / size, jnp.ones_like(least) * 2)
-    at = jnp.where(within & (least <= jnp.min(least)), fraction, right.fraction)
+    minimum = jnp.where(within, minimum / size, jnp.ones_like(minimum) * 2)
+    at = jnp.where(within & (minimum <= jnp.min(minimum)), fraction, right.fraction)
     return jnp.where(within.any(), jnp.min(at), (middle.fraction + right.fraction) / 2)
 
 
@@ -128,7 +128,7 @@ def look_within(guards: Callable, start: Point, end: Point) -> list[Point]:
         return Point(fraction, *guards(fraction))
 
     middle = look(jnp.asarray(0.5, start.fraction.dtype))
-    one = look(_least_of_parabola(start, middle, end))
+    one = look(_minimum_of_parabola(start, middle, end))
     is_left = one.fraction < middle.fraction
 
     def choose(a, b):
@@ -136,7 +136,7 @@ def look_within(guards: Callable, start: Point, end: Point) -> list[Point]:
 
     # A point at the middle itself has no parabola of its own.
     apart = jnp.abs(one.fraction - middle.fraction) > 1e-3
-    fraction = _least_of_parabola(choose(start, middle), one, choose(middle, end))
+    fraction = _minimum_of_parabola(choose(start, middle), one, choose(middle, end))
     return [middle, one, look(jnp.where(apart, fraction, 0.75))]
 
 

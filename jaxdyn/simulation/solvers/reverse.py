@@ -111,7 +111,7 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
     free, fixed = eqx.partition(args, moving)
     free_leaves, structure = jax.tree.flatten(free)
     stride, static = history.stride, (plan, times_move, structure)
-    none, least = jnp.zeros((), ts.dtype), jnp.zeros((), jnp.int32)
+    none, minimum = jnp.zeros((), ts.dtype), jnp.zeros((), jnp.int32)
     saved = jnp.asarray(ts.shape[0] - 1, jnp.int32)
 
     def back(first, last, states, cotangents: _Cotangents) -> _Cotangents:
@@ -130,10 +130,10 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
         return run_loop(task, args, (first, last), given, carry).records[0]
 
     zeros, nothing = [jnp.zeros_like(x) for x in free_leaves], jnp.zeros_like(y0)
-    places = _places(least, least, saved)
+    places = _places(minimum, minimum, saved)
     cotangents = _Cotangents(nothing, nothing, zeros, none, none, jnp.zeros_like(ts), saved, places)
     if stride == 1:
-        cotangents = back(least, history.count, history.states, cotangents)
+        cotangents = back(minimum, history.count, history.states, cotangents)
     else:
         segments = (history.count + stride - 1) // stride
 
