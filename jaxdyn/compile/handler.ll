@@ -7,8 +7,8 @@
 ; A kernel that is called for the first time has no machine code yet: `prepare`, a function of Python's, makes it, and stores its
 ; address in the table. Kernels that are never called, as of branches that are not taken, cost nothing.
 ;
-; Names in braces are filled in by target.py. A table entry is { hash, kernel, chunk, least, buffers, sizes }: `chunk` samples are
-; claimed at a time, fewer than `least` stay on one thread, and sizes[i] is the number of entries per sample of buffer i, or less than
+; Names in braces are filled in by target.py. A table entry is { hash, kernel, chunk, minimum, buffers, sizes }: `chunk` samples are
+; claimed at a time, fewer than `minimum` stay on one thread, and sizes[i] is the number of entries per sample of buffer i, or less than
 ; zero (minus one, less the number of entries) for an argument that is the same for all samples.
 
 declare ptr @malloc(i64)
@@ -441,8 +441,8 @@ go:
   %failures = load atomic i64, ptr @jaxdyn_failures acquire, align 8
   %chunk.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 2
   %chunk = load i64, ptr %chunk.at
-  %least.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 3
-  %least = load i64, ptr %least.at
+  %minimum.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 3
+  %minimum = load i64, ptr %minimum.at
   %buffers.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 4
   %buffers = load i64, ptr %buffers.at
   %sizes.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 5
@@ -474,7 +474,7 @@ not.fitting:
   %error.misfit = call ptr @failure(ptr %api, ptr @misfit, i32 3)
   ret ptr %error.misfit
 choose:
-  %is.large = icmp sge i64 %n, %least
+  %is.large = icmp sge i64 %n, %minimum
   br i1 %is.large, label %count.threads, label %alone
 count.threads:
   %available = call i64 @threads(ptr %api, ptr %context)
