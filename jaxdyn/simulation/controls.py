@@ -107,7 +107,7 @@ class Sampled(eqx.Module):
     - `law`: law(q, v, t, state) -> (tau (nv,), state); with `state=None` law(q, v, t) -> tau, the form of the laws of
       `jd.control` without a state. The leaves of an equinox Module can be differentiated and batched.
     - `state`: initial state of the law, a pytree of arrays. The law returns a state of the same structure.
-    - `period` (): sampling period, s, positive.
+    - `period` (): sampling period, s, positive; a constant to derivatives.
 
     **Raises:** ValueError for a law that cannot be called, and for a period that is not positive.
 

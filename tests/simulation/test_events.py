@@ -530,7 +530,7 @@ def point(friction, restitution=0.0):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("adjoint", ["reverse", "direct"])
+@pytest.mark.parametrize("adjoint", ["reverse", pytest.param("direct", marks=pytest.mark.slow)])
 def test_the_direction_of_friction_in_an_impact_has_derivatives(adjoint):
     """A point strikes the ground while it slides: v+ = v - mu (1 + e) |w| v / |v| along it, with e |w| upwards.
 
