@@ -167,23 +167,26 @@ def fit_steps(control: Control, stepsize: Any, ts: Any, dtype) -> Any:
         raise ValueError(
             "control is sampled, which takes fixed steps; pass stepsize=control.period, or a whole part of it"
         )
-    known, eps = is_concrete((control.period, stepsize, ts)), float(jnp.finfo(dtype).eps)
-    # Numpy outside of a trace, where each operation of JAX is a program of its own.
-    xp = np if known else jnp
-    period, step, span = xp.asarray(control.period), xp.asarray(stepsize), xp.asarray(ts[-1]) - xp.asarray(ts[0])
+    is_known_step, eps = is_concrete((control.period, stepsize)), float(jnp.finfo(dtype).eps)
+    known = is_known_step and is_concrete(ts)
+    # Numpy where it can: each operation of JAX is a program of its own outside of a trace, and traced inside of one.
+    xp = np if is_known_step else jnp
+    period, step = xp.asarray(control.period), xp.asarray(stepsize)
     ratio = period / step
     in_period = xp.round(ratio)
-    count = span * in_period / period
-    in_run = xp.round(count)
-    # The relative tolerance admits steps that were written with six digits, such as 0.000333333 for a third of 1e-3. That of the
-    # run is a fifth of the time within which `sample` takes a sample that is due.
+    # The relative tolerance admits steps that were written with six digits, such as 0.000333333 for a third of 1e-3.
     fits_period = (ratio > 0.5) & (xp.abs(ratio - in_period) < 2e-6 * ratio)
-    fits_run = (in_run > 0) & (xp.abs(count - in_run) < 0.2 * eps**0.4 * in_period)
-    if is_concrete((control.period, stepsize)) and not fits_period:
+    if is_known_step and not fits_period:
         raise ValueError(
             f"stepsize is {float(step):.6g} s, and the period of the sampled control "
             f"{float(period):.6g} s, which is {float(ratio):.6g} steps; take a whole part of it"
         )
+    xp = np if known else jnp
+    span = xp.asarray(ts[-1]) - xp.asarray(ts[0])
+    count = span * in_period / period
+    in_run = xp.round(count)
+    # A fifth of the time within which `sample` takes a sample that is due.
+    fits_run = (in_run > 0) & (xp.abs(count - in_run) < 0.2 * eps**0.4 * in_period)
     # A run without length has no steps, and times that do not increase are refused elsewhere.
     is_run = span > 0
     if known and is_run and not fits_run:

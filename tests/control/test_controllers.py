@@ -235,6 +235,14 @@ def test_runs_that_samples_do_not_fill_are_refused(slider):
     speed, refused = run(0.09, 0.03, 1.8)
     assert not refused
     np.testing.assert_allclose(speed, 0.09 * 20 * 19 / 4, rtol=1e-12)
+    # Times alone are traced.
+    ends = jax.jit(
+        lambda end: jd.simulate(slider, [0.0], [0.0], jnp.stack([0 * end, end]), throw=False, **given).result
+    )
+    assert ends(2.0) == jd.RESULTS.bad_stepsize and ends(1.8) == jd.RESULTS.successful
+    given["stepsize"] = 0.04
+    with pytest.raises(ValueError, match=r"is 2\.25 steps"):
+        ends(jnp.float32(1.8))
 
 
 def changing(q, v, t, state):
