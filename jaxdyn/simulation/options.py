@@ -34,8 +34,8 @@ class Steps(eqx.Module):
       step and trajectory.
 
     ```python
-    jd.simulate(model, q0, v0, ts, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-12))
-    jd.simulate(model, q0, v0, ts, stepsize=jd.simulation.Steps(0.01, max_steps=1000))
+    jd.simulate(scene, q, v, ts, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-12))
+    jd.simulate(scene, q, v, ts, stepsize=jd.simulation.Steps(0.01, max_steps=1000))
     ```
     """
 
