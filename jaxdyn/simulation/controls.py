@@ -190,10 +190,12 @@ def fit_steps(control: Control, stepsize: Any, ts: Any, dtype) -> Any:
     # A run without length has no steps, and times that do not increase are refused elsewhere.
     is_run = span > 0
     if known and is_run and not fits_run:
-        later = float(np.ceil(count) * period / in_period - span)
+        # Times of float32 miss a whole number of steps by their rounding.
+        number = in_run if abs(count - in_run) < 1e-3 and in_run > 0 else np.ceil(count)
         raise ValueError(
-            f"ts spans {float(span):.6g} s, which is {float(count):.6g} steps of {float(step):.6g} s; a run with a sampled "
-            f"control takes a whole number of them: end ts {later:.6g} s later, or take another stepsize"
+            f"ts spans {float(span):.9g} s, which is {float(count):.9g} steps of {float(step):.6g} s; a run with a sampled "
+            f"control takes a whole number of them: let ts span {float(number * period / in_period):.9g} s, or take another "
+            "stepsize"
         )
     # Rounding must not make one step more of it.
     length = xp.where(is_run, span / xp.where(in_run > 0, in_run, 1) * (1 + 8 * eps), step)
