@@ -143,9 +143,9 @@ def assemble(
       those that are independent, here or a finite distance away.
     - `throw`: raise when it fails, by default if all inputs are concrete.
 
-    **Returns:** `Assembly`. Derivatives, of any order, with respect to the guess and the scene's parameters are those of the
-    minimum, by the implicit function theorem. `result` is `not_nearest` where q satisfies the constraints and the search for the
-    minimum did not converge. Derivatives are NaN where it is not `successful`.
+    **Returns:** `Assembly`; without constraints the guess. Derivatives, of any order, with respect to the guess and the scene's
+    parameters are those of the minimum, by the implicit function theorem. `result` is `not_nearest` where q satisfies the
+    constraints and the search for the minimum did not converge. Derivatives are NaN where it is not `successful`.
 
     **Raises:** ValueError that names the open constraints and their residuals, if the assembly fails and `throw`; for joints in
     `hold` that do not exist, and for less than one guess.
@@ -160,7 +160,9 @@ def assemble(
     v = zeros_if_none(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     locked = add_constraints(scene, [lock_joint(*joint) for joint in hold.items()])
-    layout(locked)  # raises for joints that do not exist
+    if not layout(locked):  # raises for joints that do not exist
+        none, zero = jnp.zeros(0, q.dtype), jnp.zeros((), q.dtype)
+        return Assembly(q, v, jnp.zeros(2, q.dtype), RESULTS.successful, zero, jnp.asarray(False), none, none, ())
     atol = None if atol is None else float(atol)
 
     def from_guess(q):

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.constraints.redundancy import add_constraints
 from jaxdyn.dynamics import quantities as dynamics
+from jaxdyn.forces.elements import as_leaf
 from jaxdyn.identify.logs import Log, as_logs, check_log
 from jaxdyn.identify.mechanisms import FitSystem, Measured, build_scene, motor_basis, on_constraints
 from jaxdyn.identify.regression import torque_error
@@ -32,13 +33,14 @@ INITIAL = ("measured", "free")
 class SampledTorque(eqx.Module):
     """Control that replays torques: linear between the samples, or held from each sample to the next ("previous").
 
-    Fixed steps that end on the samples integrate held torques exactly, as these are constant within a step.
+    Fixed steps, a whole number of which fills the time between two samples, integrate held torques exactly: these are constant
+    within a step.
 
     `t` (n,) s; `tau` (n, nv) N m.
     """
 
-    t: Float[Array, " n"]
-    tau: Float[Array, "n nv"]
+    t: Float[Array, " n"] = eqx.field(converter=as_leaf("SampledTorque: t"))
+    tau: Float[Array, "n nv"] = eqx.field(converter=as_leaf("SampledTorque: tau"))
     hold: str = eqx.field(static=True, default="linear")
 
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
@@ -217,8 +219,7 @@ def with_even_steps(options: dict, data: Segments) -> dict:
         return options
     options = dict(options)
     count = gaps.shape[1] * options.pop("substeps")
-    # The number of steps is rounded up, and their length then follows from it.
-    return {"max_steps": count + 1} | options | {"stepsize": float(np.ptp(t[0])) / (count - 0.5)}
+    return {"max_steps": count + 1} | options | {"stepsize": float(np.ptp(t[0])) / count}
 
 
 def simulate_segment(

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.lie.series import inverse_coefficient, stumpff
+from jaxdyn.lie.series import accept_lists, inverse_coefficient, stumpff
 
 from . import so3
 from .so3 import cross, matmul
@@ -271,6 +271,8 @@ __all__ = [
     "log",
     "vee",
 ]
+
+accept_lists(globals())
 
 
 def __dir__() -> list[str]:

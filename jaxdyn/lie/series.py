@@ -7,6 +7,7 @@ where), because an overflowing or undefined branch that is not selected still ha
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -117,3 +118,20 @@ def safe_sqrt(square: Array) -> Array:
     # The inner `where` matters for derivatives: 0 times the infinite derivative of the root would be NaN.
     some = square > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, jnp.ones_like(square))), jnp.zeros_like(square))
+
+
+def accept_lists(module: dict[str, Any]) -> None:
+    """Let the public functions in the namespace of a module take lists of numbers in place of arrays."""
+
+    def accepting(function):
+        @functools.wraps(function)
+        def call(*args, **options):
+            return function(*map(_as_array, args), **{name: _as_array(x) for name, x in options.items()})
+
+        return call
+
+    module.update({name: accepting(module[name]) for name in module["__all__"]})
+
+
+def _as_array(value):
+    return jnp.asarray(value, float) if isinstance(value, (list, tuple)) else value

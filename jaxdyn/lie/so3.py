@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.lie.series import angle_ratio, inverse_coefficient, stumpff
+from jaxdyn.lie.series import accept_lists, angle_ratio, inverse_coefficient, stumpff
 
 Vector = Float[Array, "3"]
 Matrix = Float[Array, "3 3"]
@@ -359,6 +359,8 @@ __all__ = [
     "quat_to_matrix",
     "vee",
 ]
+
+accept_lists(globals())
 
 
 def __dir__() -> list[str]:

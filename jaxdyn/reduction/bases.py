@@ -82,7 +82,7 @@ class Independent(Basis):
 
     def at(self, scene, q, t):
         """Parametrisation with a unit matrix in the rows of the independent velocities."""
-        A, b = _affine_rows(scene, q, t)
+        A, b = affine_rows(scene, q, t)
         kept = np.asarray(self.velocities, int)
         rest = np.setdiff1d(np.arange(scene.nv), kept)
         A2 = A[:, rest]
@@ -112,7 +112,7 @@ class UserBasis(Basis):
 
     def at(self, scene, q, t):
         """Parametrisation by the function's N and v0, with its quality."""
-        A, b = _affine_rows(scene, q, t)
+        A, b = affine_rows(scene, q, t)
         value = self.function(q, t)
         N, v0 = value if isinstance(value, tuple) else (value, None)
         N = jnp.asarray(N, q.dtype)
@@ -169,7 +169,7 @@ class Orthonormal(Basis):
 
     def _at(self, scene, q, t):
         """Parametrisation, and A, A^+ and T."""
-        A, b = _affine_rows(scene, q, t)
+        A, b = affine_rows(scene, q, t)
         reference = self.reference.astype(A.dtype)
         # A data dependence orders this factorisation after that of the reference: two concurrent ones of a large batch
         # can deadlock jaxlib 0.10.
@@ -373,7 +373,8 @@ def min_quality(dtype) -> float:
 constraint_jacobian_compiled = entry_point(constraint_jacobian)
 
 
-def _affine_rows(scene, q, t):
+def affine_rows(scene, q, t):
+    """Rows A (nc, nv) and b (nc,) of the constraints A v = b."""
     # The residual of the rows is A v - b, and -b at v = 0.
     return constraint_jacobian(scene, q, t), -velocity_residual(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
 

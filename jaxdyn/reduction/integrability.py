@@ -19,7 +19,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_shape, check_state, zeros_if_none
 from jaxdyn.reduction.bases import (
     Independent,
-    Orthonormal,
+    affine_rows,
     as_basis,
     constraint_jacobian_compiled,
     pivot_rows,
@@ -38,11 +38,19 @@ class Involutivity(NamedTuple):
     - `value`: true where brackets stay in it; the motion then stays on a family of surfaces, as under holonomic rows.
     - `ranks`: dimensions of the distribution and of the span of its brackets, by level, until they stop growing.
     - `singular_values`: of the unit fields of each level, from which the ranks follow.
+    - `complete`: false where brackets of more fields than were computed (6) are needed, at a singular configuration.
     """
 
     value: bool
     ranks: tuple[int, ...]
     singular_values: tuple[np.ndarray, ...]
+    complete: bool = True
+
+
+# Levels of brackets at a singular configuration: the derivatives of each cost three times those of the one before.
+_LEVELS = 6
+# Points around the configuration, and the way to them in metres and radians: three legs of constant velocities.
+_POINTS, _LEGS, _STEPS, _LENGTH = 8, 3, 10, 0.1
 
 
 def involutive(
@@ -55,8 +63,11 @@ def involutive(
     constraints in the rows, ranks[-1] - ranks[0] that of the nonholonomic ones. Rows A v = b with b != 0 are
     tested together with their drift v0 + d/dt.
 
-    **Arguments:** `q` (nq,) and `t`, concrete; `dof` and `rank_tol` as in `tangent_basis`. The ranks are assumed to be
-    constant around q: at a singularity they are valid only there.
+    At a singular configuration (two trailers at right angles) ranks pause: (2, 3, 4, 4, 5) where they are (2, 3, 4, 5) around it.
+    The last rank is the same at all places that motions reach, if the rows are analytic. So it is looked up at one of them.
+
+    **Arguments:** `q` (nq,) and `t`, concrete; `dof` and `rank_tol` as in `tangent_basis`. The rank of A is assumed to be
+    constant around q.
 
     **Returns:** `Involutivity`.
 
@@ -66,7 +77,7 @@ def involutive(
     jd.reduction.involutive(jd.scenes.rolling_disk(), q).ranks  # (2, 3, 4)
     ```
 
-    Source: Murray, Li & Sastry (1994), section 7.2; EQUATIONS section 6.
+    Source: Murray, Li & Sastry (1994), section 7.2; Jean (1996), ESAIM: COCV 1, 241, for trailers; EQUATIONS section 6.
     """
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
@@ -77,51 +88,113 @@ def involutive(
     scene = independent_rows(scene, q, t, rank_tol)
     reference = tangent_basis(scene, q, t, dof=dof, rank_tol=rank_tol)
     count, limit = reference.shape[1], tolerance(rank_tol, q)
+    # Of the rows of A as many sums as are independent at q, and columns B by which they change.
+    A = np.asarray(constraint_jacobian_compiled(scene, q, t))
+    rows = np.linalg.svd(A)[0].T[: scene.nv - count]
+    frame = reference, jnp.asarray(rows), jnp.asarray(np.linalg.pinv(rows @ A))
     # Brackets stay tangent to the holonomic constraints.
-    A_holonomic = np.asarray(constraint_jacobian_compiled(scene, q, t))[holonomic_rows(layout(scene))]
+    A_holonomic = A[holonomic_rows(layout(scene))]
     maximum = scene.nv - (
         int(np.linalg.matrix_rank(A_holonomic, tol=1e-9 * np.abs(A_holonomic).max())) if A_holonomic.size else 0
     )
-    # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
-    # bracketed with the others and spans nothing itself.
-    levels: tuple[tuple[tuple[int, int], ...], ...] = ()
-    new = np.asarray(_fields(scene, reference, q, t, levels), float)[:, :count]
-    spanned, ranks, evidence = np.zeros((scene.nq, 0)), [], []
-    # Every pass but the last adds a dimension, of which there are at most nq.
-    while True:
-        if not np.isfinite(new).all():
-            raise ValueError(
-                f"the rows have derivatives of order {len(levels)} that are not finite at q = {np.asarray(q).tolist()}; choose "
-                "another configuration"
-            )
-        sizes = np.linalg.svd(np.concatenate([spanned, new], 1), compute_uv=False)
-        evidence.append(sizes)
-        # A level spans that before. Much longer brackets raise the threshold, which must not take dimensions away again.
-        ranks.append(max(int(np.sum(sizes > limit * sizes[0])), *ranks[-1:], 0))
-        if len(ranks) > 1 and (ranks[-1] == ranks[-2] or ranks[-1] >= maximum):
-            return Involutivity(ranks[-1] == ranks[0], tuple(ranks), tuple(evidence))
-        # With constant rank, the fields that are independent at q span the level around it.
-        # Directions in the span already are removed once; pivoting, the largest first, then needs only the new columns.
-        rest = new - spanned @ np.linalg.lstsq(spanned, new, rcond=None)[0] if spanned.shape[1] else new
-        columns, pivots = pivot_rows(rest.T)
-        kept = columns[pivots > limit * sizes[0]].tolist()
-        spanned = np.concatenate([spanned, new[:, kept]], 1)
-        pairs = [(i, k) for k in kept for i in range(count + 1) if levels or i > k]  # [X_k, X_i] = -[X_i, X_k]
-        levels = (*levels, tuple(pairs))
-        new = np.asarray(_fields(scene, reference, q, t, levels), float)
+    points = _points_around(scene, frame, q, t)
+
+    def climb(points, target=None):
+        """Ranks at the first two points by level, and singular values at the first; None where the second has none."""
+        # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
+        # bracketed with the others and spans nothing itself.
+        levels: tuple[tuple[tuple[int, int], ...], ...] = ()
+        new = np.asarray(_fields(scene, frame, points, t, levels), float)[..., :count]
+        spanned, ranks, evidence = new[..., :0], [], []
+        while True:
+            if not np.isfinite(new[0]).all():
+                raise ValueError(
+                    f"the rows have derivatives of order {len(levels)} that are not finite at q = {np.asarray(q).tolist()}; "
+                    "choose another configuration"
+                )
+            if not np.isfinite(new).all():
+                return None
+            sizes = [np.linalg.svd(columns, compute_uv=False) for columns in np.concatenate([spanned, new], -1)[:2]]
+            evidence.append(sizes[0])
+            # A level spans that before. Much longer brackets raise the threshold, which must not take dimensions away again.
+            before = ranks[-1] if ranks else (0, 0)
+            ranks.append(tuple(max(int(np.sum(x > limit * x[0])), n) for x, n in zip(sizes, before, strict=True)))
+            if target is None:
+                # Every pass but the last adds a dimension, of which there are at most nq.
+                ends = len(ranks) > 1 and (ranks[-1] == before or max(ranks[-1]) >= maximum)
+            else:
+                ends = ranks[-1][0] >= target or len(ranks) == _LEVELS
+            if ends:
+                return ranks, tuple(evidence)
+            if target is None:
+                # With constant rank, the fields that are independent at a point span the level around it.
+                # Directions in the span already are removed once; pivoting, the largest first, then needs only the new columns.
+                inside, rest = spanned[1], new[1]
+                rest = rest - inside @ np.linalg.lstsq(inside, rest, rcond=None)[0] if inside.shape[1] else rest
+            else:
+                # Fields that depend on others at one point may not do so around it: those that are sums of others go.
+                rest = new.reshape(-1, new.shape[-1])
+            columns, pivots = pivot_rows(rest.T)
+            kept = columns[pivots > limit * sizes[1][0]].tolist()
+            spanned = np.concatenate([spanned, new[..., kept]], -1)
+            pairs = [(i, k) for k in kept for i in range(count + 1) if levels or i > k]  # [X_k, X_i] = -[X_i, X_k]
+            levels = (*levels, tuple(pairs))
+            new = np.asarray(_fields(scene, frame, points, t, levels), float)
+
+    climbed = climb(points[:2]) or climb(points[[0, 0]])
+    assert climbed is not None  # the first point is finite, or an error was raised
+    ranks, evidence = climbed
+    dimension = max(ranks[-1])
+    if any(here < around for here, around in ranks):
+        ranks, evidence = climb(points, dimension) or climbed
+    at_q = tuple(here for here, _ in ranks)
+    return Involutivity(dimension == at_q[0], at_q, evidence, at_q[-1] == dimension)
 
 
-@eqx.filter_jit
-def _fields(scene, reference, q, t, levels):
-    """Rates of q (nq, n) of the last level of brackets; level 0 has the columns of N(q, t) and the drift (v0, d/dt)."""
+def _generators(scene, frame):
+    """Rates of (q, t), (n, nq + 1), as a function of these: those of the columns of N(q, t), and of the drift (v0, d/dt)."""
+    reference, rows, lift = frame
 
     @jax.jit
     def generators(x):
         q, t = x[:-1], x[-1]
-        frame = Orthonormal(reference).at(scene, q, t)
-        rates = jax.vmap(lambda v: velocity_to_rate(scene.system, q, v))(jnp.concatenate([frame.N.T, frame.v0[None]]))
+        A, b = affine_rows(scene, q, t)
+        A, b = matmul(rows, A), matmul(rows, b)
+        # N = R - B (A B)^-1 A R with constant R and B: of all frames the one with the shortest derivatives.
+        solved = jnp.linalg.solve(matmul(A, lift), jnp.concatenate([matmul(A, reference), b[:, None]], 1))
+        moved = matmul(lift, solved)
+        frame = jnp.concatenate([reference - moved[:, :-1], moved[:, -1:]], 1)
+        rates = jax.vmap(lambda v: velocity_to_rate(scene.system, q, v))(frame.T)
         times = jnp.zeros((rates.shape[0], 1), q.dtype).at[-1].set(1.0)
         return jnp.concatenate([rates, times], 1)
+
+    return generators
+
+
+@eqx.filter_jit
+def _points_around(scene, frame, q, t):
+    """Configurations (n, nq): q, and some that admissible motions from there reach, by steps of the classical method."""
+    generators, x = _generators(scene, frame), jnp.concatenate([q, t[None]])
+    ways = np.random.default_rng(0).normal(size=(_POINTS, _LEGS, frame[0].shape[1]))
+    ways = np.repeat(ways / np.linalg.norm(ways, axis=-1, keepdims=True), _STEPS, axis=1) * (_LENGTH / _STEPS)
+
+    def step(x, way):
+        def rate(x):
+            return matmul(way, generators(x)[:-1])
+
+        first = rate(x)
+        second = rate(x + first / 2)
+        third = rate(x + second / 2)
+        return x + (first + 2 * second + 2 * third + rate(x + third)) / 6, None
+
+    ends = jax.vmap(lambda way: jax.lax.scan(step, x, way)[0])(jnp.asarray(ways, q.dtype))
+    return jnp.concatenate([x[None], ends])[:, :-1]
+
+
+@eqx.filter_jit
+def _fields(scene, frame, points, t, levels):
+    """Rates of q (points, nq, n) of the last level of brackets; level 0 has the columns of N(q, t) and the drift (v0, d/dt)."""
+    generators = _generators(scene, frame)
 
     def brackets(inner, pairs):
         outer, within = np.array(pairs).T
@@ -139,7 +212,7 @@ def _fields(scene, reference, q, t, levels):
     last = generators
     for pairs in levels:
         last = brackets(last, pairs)
-    return last(jnp.concatenate([q, t[None]]))[:, :-1].T
+    return jax.vmap(lambda q: last(jnp.concatenate([q, t[None]]))[:, :-1].T)(points)
 
 
 class SpuriousTerms(NamedTuple):

@@ -98,7 +98,7 @@ class Controller(eqx.Module):
 class Sampled(eqx.Module):
     """A discrete controller: the law is called at the start and after every `period`, and its torque is held in between.
 
-    It needs fixed steps (`stepsize`), of which a whole number fills a period, and a whole number the run from ts[0] to ts[-1].
+    It needs fixed steps (`stepsize`), of which a whole number fills a period. The last step of a run may be shorter.
     If a save point is a sampling instant, the outputs "torque" and "control_state" there are the values before or after the
     sample, depending on the rounding of the times. To read them, save between samples. The motion does not depend on that.
 
@@ -152,12 +152,10 @@ def as_control(control: Control) -> Any:
     return as_pytree(control, "control")
 
 
-def fit_steps(control: Control, stepsize: Any, ts: Any, dtype) -> Any:
-    """Length of the steps of a run: for a sampled law that of a whole number of them in a period and in the run, else as given.
+def fit_steps(control: Control, stepsize: Any) -> Any:
+    """Length of the steps of a run: for a sampled law that of a whole number of them in a period, else as given.
 
-    Steps of a run have one length, the longest one up to `stepsize` of which a whole number fills the run. Where that is another
-    length, no step ends when a sample is due, and the law would be called late. NaN for traced numbers that do not fit, which
-    ends the run with the code `bad_stepsize`.
+    NaN for traced numbers that do not fit, which ends the run with the code `bad_stepsize`.
 
     **Raises:** ValueError for adaptive steps, and for known numbers that do not fit.
     """
@@ -167,39 +165,21 @@ def fit_steps(control: Control, stepsize: Any, ts: Any, dtype) -> Any:
         raise ValueError(
             "control is sampled, which takes fixed steps; pass stepsize=control.period, or a whole part of it"
         )
-    is_known_step, eps = is_concrete((control.period, stepsize)), float(jnp.finfo(dtype).eps)
-    known = is_known_step and is_concrete(ts)
+    known = is_concrete((control.period, stepsize))
     # Numpy where it can: each operation of JAX is a program of its own outside of a trace, and traced inside of one.
-    xp = np if is_known_step else jnp
+    xp = np if known else jnp
     period, step = xp.asarray(control.period), xp.asarray(stepsize)
     ratio = period / step
-    in_period = xp.round(ratio)
+    count = xp.round(ratio)
     # The relative tolerance admits steps that were written with six digits, such as 0.000333333 for a third of 1e-3.
-    fits_period = (ratio > 0.5) & (xp.abs(ratio - in_period) < 2e-6 * ratio)
-    if is_known_step and not fits_period:
+    fits = (ratio > 0.5) & (xp.abs(ratio - count) < 2e-6 * ratio)
+    if known and not fits:
         raise ValueError(
             f"stepsize is {float(step):.6g} s, and the period of the sampled control "
             f"{float(period):.6g} s, which is {float(ratio):.6g} steps; take a whole part of it"
         )
-    xp = np if known else jnp
-    span = xp.asarray(ts[-1]) - xp.asarray(ts[0])
-    count = span * in_period / period
-    in_run = xp.round(count)
-    # A fifth of the time within which `sample` takes a sample that is due.
-    fits_run = (in_run > 0) & (xp.abs(count - in_run) < 0.2 * eps**0.4 * in_period)
-    # A run without length has no steps, and times that do not increase are refused elsewhere.
-    is_run = span > 0
-    if known and is_run and not fits_run:
-        # Times of float32 miss a whole number of steps by their rounding.
-        number = in_run if abs(count - in_run) < 1e-3 and in_run > 0 else np.ceil(count)
-        raise ValueError(
-            f"ts spans {float(span):.9g} s, which is {float(count):.9g} steps of {float(step):.6g} s; a run with a sampled "
-            f"control takes a whole number of them: let ts span {float(number * period / in_period):.9g} s, or take another "
-            "stepsize"
-        )
-    # Rounding must not make one step more of it.
-    length = xp.where(is_run, span / xp.where(in_run > 0, in_run, 1) * (1 + 8 * eps), step)
-    return length if known else jax.lax.stop_gradient(jnp.where(fits_period & (fits_run | ~is_run), length, jnp.nan))
+    length = period / xp.maximum(count, 1)
+    return length if known else jax.lax.stop_gradient(jnp.where(fits, length, jnp.nan))
 
 
 def can_end(control: Control, q, v, t) -> bool:

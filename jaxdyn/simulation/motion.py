@@ -369,7 +369,7 @@ def _by_diffrax(given: DiffraxRun, inputs, steps, options: Options) -> Outcome:
         rows, (result, *facts) = run_adaptively(inputs, given, options.limit_is_given)
         return Outcome(rows, from_diffrax(result), *facts)
     rows, (result, counts, reached, *last), solution = run(inputs, given)
-    sums = solution.controller_state[2:] if isinstance(given.controller, ErrorMonitoredSteps) else None
+    sums = solution.controller_state[3:] if isinstance(given.controller, ErrorMonitoredSteps) else None
     # diffrax is at the end of the step that could not be solved; what is known ends at its beginning.
     before = ts[0] + (counts["num_steps"].astype(ts.dtype) - 1) * steps[-1]
     result = from_diffrax(result)

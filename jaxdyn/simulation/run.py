@@ -126,8 +126,9 @@ def simulate(
       the scene's forces in the acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps;
       for adaptive ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at
       the start says that explicit steps would have to be shorter than a thousandth of the time.
-    - `stepsize`: None for adaptive steps with tolerances of 1e-8, a number (s) for fixed ones, a diffrax step-size controller,
-      or `jd.simulation.Steps(size, rtol, atol, max_steps)`, which sets tolerances and limits too.
+    - `stepsize`: None for adaptive steps with tolerances of 1e-8, a number (s) for fixed ones, the last one as short as
+      the run asks for, a diffrax step-size controller, or `jd.simulation.Steps(size, rtol, atol, max_steps)`, which sets
+      tolerances and limits too.
     - `adjoint`: how derivatives are computed.
 
         - "reverse" (default): reverse mode with checkpoints, and Hessians over it.
@@ -171,7 +172,7 @@ def simulate(
     start = tuple([np.asarray(x) if concrete else as_numpy_if_known(x) for x in arrays[:3]])
     scene, method = _prepare_start(scene, method, start, stepsize, modal, concrete)
     dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
-    length = controls.fit_steps(control, stepsize, start[2], dtype)
+    length = controls.fit_steps(control, stepsize)
     check_terminals(terminals, modal, (start[0], start[1], start[2][0]) if concrete else None)
     solver = _solver_at_start(scene, control, solver, stepsize, adjoint, arrays, modal)
     options = _choose(

@@ -81,7 +81,7 @@ ADVICE = {
     "nonfinite_start": "give finite q0 and v0 and unit quaternions",
     "unnormalized_start": "start from jd.normalize(model, q0); quaternions are in the order w, x, y, z",
     "unordered_times": "give times ts that increase from each to the next",
-    "bad_stepsize": "give a positive stepsize (s); for a sampled control, a whole number fills its period and the run",
+    "bad_stepsize": "give a positive stepsize (s); for a sampled control, a whole part of its period",
     "bad_tolerance": "give finite rtol and atol that are not negative",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
     "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.solvers.Rodas5P(); "

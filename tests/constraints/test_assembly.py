@@ -97,6 +97,17 @@ def test_redundant_rows_are_said():
     assert jd.assemble(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0]).redundancies() == []
 
 
+def test_without_constraints_the_guess_is_the_answer():
+    q, v = jnp.array([0.3, -0.2]), jnp.array([1.0, 2.0])
+    state = jd.assemble(jd.robots.chain(2), q, v)
+    assert bool(state.success) and "successful" in str(state)
+    np.testing.assert_array_equal(state.q, q)
+    np.testing.assert_array_equal(state.v, v)
+    np.testing.assert_array_equal(state.residual, 0.0)
+    batch = jax.vmap(lambda q: jd.assemble(jd.robots.chain(2), q).q)(jnp.stack([q, v]))
+    np.testing.assert_array_equal(batch, [q, v])
+
+
 @pytest.mark.parametrize("guess", [pytest.param(1e308, marks=pytest.mark.slow), np.inf, np.nan])
 def test_a_guess_without_end_is_refused_with_the_open_loop(guess):
     # LAPACK's own error came first, where the path had left the finite numbers.

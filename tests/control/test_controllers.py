@@ -1,5 +1,6 @@
 """Controllers with a state, sampled ones, and their outputs."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -217,34 +218,44 @@ def test_samples_are_taken_when_they_are_due(slider, period, step, t0):
     np.testing.assert_allclose(motion.v[:, 0], speeds, rtol=1e-8)
 
 
-def test_runs_that_samples_do_not_fill_are_refused(slider):
-    """Steps have one length, which fills the run: of 2 s 1/67, where 0.03 s are asked for, and a sample would be late."""
-    given = {"control": with_period(0.09), "stepsize": 0.03}
-    with pytest.raises(ValueError, match=r"ts spans 2 s, which is 66\.6666667 steps of 0\.03 s; .* span 2\.01 s"):
-        jd.simulate(slider, [0.0], [0.0], [0.0, 2.0], **given)
-    with pytest.raises(ValueError, match=r"ts spans 1\.79999995 s, .* span 1\.8 s"):
-        jd.simulate(slider, [0.0], [0.0], np.array([0.0, 1.8], np.float32), **given)
-    np.testing.assert_allclose(jd.simulate(slider, [0.0], [0.0], [0.0, 2.01], **given).v[-1], 10.725, rtol=1e-12)
+def speed_of(period, t):
+    """Speed at the time t under the torques of COUNT, in closed form."""
+    n = np.floor(t / period)
+    return period * n * (n - 1) / 4 + (t - n * period) * n / 2
+
+
+@pytest.mark.parametrize("solver", [None, diffrax.Tsit5(), diffrax.Kvaerno3()])
+def test_the_last_step_is_shorter(slider, solver):
+    """A run of 66 steps of 0.03 s and one of 0.02 s: samples stay at multiples of the period, 3 steps."""
+    given = {"control": with_period(0.09), "stepsize": 0.03, "solver": solver}
+    times = np.array([0.0, 0.1, 2.0])
+    motion = jd.simulate(slider, [0.0], [0.0], times, **given)
+    np.testing.assert_allclose(motion.v[1:, 0], speed_of(0.09, times[1:]), rtol=1e-12)
+    assert motion.stats["num_steps"] == 67
 
     @jax.jit
     def run(period, step, end):
         motion = jd.simulate(
-            slider, [0.0], [0.0], jnp.stack([0 * end, end]), control=with_period(period), stepsize=step, throw=False
-        )
+            slider, [0.0], [0.0], jnp.stack([0 * end, end]), throw=False,
+            **given | {"control": with_period(period), "stepsize": step},
+        )  # fmt: skip
         return motion.v[-1, 0], motion.result == jd.RESULTS.bad_stepsize
 
-    assert run(0.09, 0.03, 2.0)[1] and run(0.09, 0.04, 1.8)[1]
-    speed, refused = run(0.09, 0.03, 1.8)
-    assert not refused
-    np.testing.assert_allclose(speed, 0.09 * 20 * 19 / 4, rtol=1e-12)
-    # Times alone are traced.
-    ends = jax.jit(
-        lambda end: jd.simulate(slider, [0.0], [0.0], jnp.stack([0 * end, end]), throw=False, **given).result
+    for end in (1.0, 2.0):
+        speed, refused = run(0.09, 0.03, end)
+        assert not refused
+        np.testing.assert_allclose(speed, speed_of(0.09, end), rtol=1e-12)
+    assert run(0.09, 0.04, 1.8)[1]
+    # The end of the last step follows the end of the run: the last of 23 torques, on 2 kg.
+    np.testing.assert_allclose(jax.grad(lambda end: run(0.09, 0.03, end)[0])(2.0), 22 / 2, rtol=1e-12)
+
+
+def test_samples_are_due_at_times_of_float32(slider):
+    """1.8 s is rounded to less than twenty periods."""
+    motion = jd.simulate(
+        slider, [0.0], [0.0], np.array([0.0, 1.8], np.float32), control=with_period(0.09), stepsize=0.03
     )
-    assert ends(2.0) == jd.RESULTS.bad_stepsize and ends(1.8) == jd.RESULTS.successful
-    given["stepsize"] = 0.04
-    with pytest.raises(ValueError, match=r"is 2\.25 steps"):
-        ends(jnp.float32(1.8))
+    np.testing.assert_allclose(motion.v[-1, 0], speed_of(0.09, float(np.float32(1.8))), rtol=1e-12)
 
 
 def changing(q, v, t, state):

@@ -578,3 +578,20 @@ def test_large_angles(dtype):
     huge = jnp.asarray([3.0, 1.0, -2.0], dtype=dtype) * 1e15
     every = jit(jax.jacrev(lambda x: (so3.exp(x), so3.left_jacobian(x), so3.quat_exp(x))))
     assert all(jnp.all(jnp.isfinite(y)) for y in every(huge))
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_lists_are_arrays(name, monkeypatch):
+    x, y = map(jnp.asarray, random_elements(name, 2))
+    wanted = public_calls(name, x, y)
+
+    def by_lists(function):
+        return lambda *args: function(*(arg if isinstance(arg, str) else np.asarray(arg).tolist() for arg in args))
+
+    module = GROUPS[name]
+    monkeypatch.setitem(
+        GROUPS, name, types.SimpleNamespace(**{each: by_lists(getattr(module, each)) for each in module.__all__})
+    )
+    for key, value in public_calls(name, x.tolist(), y.tolist()).items():
+        np.testing.assert_array_equal(value, wanted[key], err_msg=key)
+    assert np.asarray(so3.hat(phi=[1, 2, 3])).dtype == float

@@ -102,6 +102,52 @@ def test_brackets_end():
         jd.reduction.involutive(jd.Scene(free(3), (kink,)), place.at[2].set(0.0))
 
 
+def trailers(theta):
+    """A car and two trailers, hitched a metre ahead of their axles, with headings theta; q = (x, y of the last axle, theta)."""
+
+    def rows(q, t):
+        """No axle slips sideways: its speed is that of the last one and of the bars between them."""
+        theta = q[2:]
+        sideways = jnp.stack([jnp.sin(theta), -jnp.cos(theta)], 1)
+        ahead = jnp.arange(3)[:, None] < jnp.arange(3)
+        return jnp.concatenate([sideways, -ahead * jnp.cos(theta[:, None] - theta)], 1)
+
+    return jd.reduction.involutive(jd.Scene(free(5), (jd.Pfaffian(rows),)), jnp.asarray([0.1, 0.2, *theta]))
+
+
+@pytest.mark.slow
+def test_growth_of_trailers_at_right_angles():
+    """Jean (1996): two trailers grow by 2, 3, 4, 5, but where the first is at right angles to the car by 2, 3, 4, 4, 5."""
+    for theta, ranks in (
+        ([0.3, 0.7, 0.9], (2, 3, 4, 5)),
+        ([0.3, 0.7, 0.7 + np.pi / 2], (2, 3, 4, 5)),
+        ([0.3, 0.3 + np.pi / 2, 0.9], (2, 3, 4, 4, 5)),
+    ):
+        computed = trailers(theta)
+        assert computed.ranks == ranks and computed.complete and not computed.value
+        assert len(computed.singular_values) == len(ranks)
+
+
+def flat_to(order):
+    """dz = y^n dx: of d/dx + y^n d/dz and d/dy the first bracket with a part along z at y = 0 is that of n times d/dy."""
+    return jd.Scene(free(3), (jd.Pfaffian(lambda q, t: jnp.stack([-(q[1] ** order), 0 * t, 1 + 0 * t])),))
+
+
+@pytest.mark.long
+def test_growth_pauses_at_singular_places(monkeypatch):
+    """In closed form: Martinet's distribution, and one that is integrable at z = 0 alone, where no motion leaves the plane."""
+    place = jnp.asarray([0.3, 0.0, 0.1])
+    computed = jd.reduction.involutive(flat_to(2), place)
+    assert computed.ranks == (2, 2, 3) and computed.complete and not computed.value
+    assert jd.reduction.involutive(flat_to(2), place.at[1].set(0.5)).ranks == (2, 3)
+    plane = jd.Scene(free(3), (jd.Pfaffian(lambda q, t: jnp.stack([-q[1] * q[2], 0 * t, 1 + 0 * t])),))
+    computed = jd.reduction.involutive(plane, jnp.asarray([0.3, 0.5, 0.0]))
+    assert computed.ranks == (2, 2) and computed.complete and computed.value
+    monkeypatch.setattr("jaxdyn.reduction.integrability._LEVELS", 2)
+    computed = jd.reduction.involutive(flat_to(2), place)
+    assert computed.ranks == (2, 2) and not computed.complete and not computed.value
+
+
 def test_involutive_refuses():
     with pytest.raises(ValueError, match="no constraints"):
         jd.reduction.involutive(jd.Scene(free(2)), jnp.zeros(2))

@@ -135,3 +135,10 @@ def test_torques_held_from_step_to_step_are_those_within_each(name):
 
     motion = jd.simulate(model, jnp.zeros(1), jnp.zeros(1), ts, control=by_number, **choice)
     np.testing.assert_allclose(motion.v[:, 0], v, rtol=1e-11, atol=1e-13)
+
+
+def test_torques_are_held_in_a_run_that_steps_do_not_fill():
+    """Forces of 1, 2, ... N on 1 kg from tenth to tenth of a second, to 0.25 s."""
+    control = jd.identify.SampledTorque([0.0, 0.1, 0.2, 0.3], [[1.0], [2.0], [3.0], [4.0]], "previous")
+    motion = jd.simulate(slider(), [0.0], [0.0], [0.0, 0.25], control=control, stepsize=0.1)
+    np.testing.assert_allclose(motion.v[-1], 0.1 + 0.2 + 0.05 * 3, rtol=1e-14)

@@ -176,9 +176,6 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
     y = system.with_slip(y0, begun.v, begun.slip)
     if elements.each:
         y = _begin_mode(system, (unknown, begun.mode), ts[0], y)[0]
-    if stepsize is not None:
-        # One grid for the whole run: steps that an event has cut return to it.
-        stepsize = (ts[-1] - ts[0]) / driver.number_of_steps(ts[0], ts[-1], stepsize).astype(ts.dtype)
     control = driver.step_control(plan.solver(), stepsize)
     limits, steps = driver.begin(plan, control, (unknown, begun.mode), ts, y, rtol, atol, stepsize)
     result = first_of(_cases(begun), RESULTS.successful)

@@ -320,7 +320,7 @@ def first_step(terms, t0, t1, y0, args, order, rtol, atol, norm):
 
 
 class ErrorMonitoredSteps(diffrax.ConstantStepSize):
-    """diffrax's fixed steps, with the sum of their error estimates. A method without an error estimate leaves the sum at zero.
+    """Fixed steps that end at min(t0 + k h, t1), with the sum of their error estimates, zero for a method without an estimate.
 
     A method of order p estimates its error in a step by some e of h^k. The estimates of embedded methods, k = p, overestimate it
     and are added directly. That of `RK4`, k = 3, overestimates it too much; but if all moves at one rate and the step is d,
@@ -333,19 +333,20 @@ class ErrorMonitoredSteps(diffrax.ConstantStepSize):
     order: int | None = eqx.field(static=True)
 
     def init(self, terms, t0, t1, y0: Any, dt0, args, func, error_order):
-        """End of the first step; diffrax's state with the start, the sums of errors, and the greatest distances."""
-        end, inner = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
-        start = jax.lax.stop_gradient(y0)
-        return end, (inner, start, *no_sums(y0))
+        """End of the first step; its number, the grid, the start, the sums of errors, and the greatest distances."""
+        start, length = jax.lax.stop_gradient((y0, dt0))
+        return t0 + length, (jnp.ones((), jnp.int32), (t0, length), start, *no_sums(y0))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order: Any, controller_state: Any):
         """Add the error of a step to the sum, and go to the next one."""
-        inner, start, errors, distances = controller_state
-        *step, inner, result = super().adapt_step_size(t0, t1, y0, y1_candidate, args, y_error, error_order, inner)
+        number, (begin, length), start, errors, distances = controller_state
         if y_error is not None:
             order: Any = self.order
             errors, distances = add_error(order, error_order, start, y0, y1_candidate, y_error, errors, distances)
-        return *step, (inner, start, errors, distances), result
+        number = number + 1
+        # From the start of the run, as sums of lengths would carry their rounding on. diffrax ends the last step at the end.
+        end, codes = begin + number.astype(length.dtype) * length, diffrax.RESULTS
+        return True, t1, end, False, (number, (begin, length), start, errors, distances), codes.successful
 
 
 def no_sums(y):

@@ -69,13 +69,16 @@ def step_control(solver: Any, stepsize, norm: Callable = optimistix.rms_norm) ->
 
 
 class Limits(NamedTuple):
-    """Constants of a run: its ends, the time from which a step goes to the end, and what sets the length of steps."""
+    """Constants of a run: its ends, the time from which a step goes to the end, and what sets the length of steps.
+
+    Fixed steps of a length h end at min(start + k h, end): the last one may be shorter.
+    """
 
     start: Array
     end: Array
     floor: Array
     min_at_end: Array
-    steps: Array
+    length: Array  # of fixed steps
     rtol: Array
     atol: Array
     y0: Array
@@ -112,12 +115,11 @@ def begin(plan: Plan, control, args, ts, y0, rtol, atol, stepsize, records=()) -
     # Fixed steps have no tolerances: zeros keep one structure of the loop's constants.
     rtol, atol = (jnp.zeros_like(start) if x is None else x for x in (rtol, atol))
     rate, length, quality, (values, levels) = _begin(plan, control, args, start, end, y0, rtol, atol)
-    steps = none
     if not isinstance(control, AdaptiveSteps):
-        length, steps = stepsize, number_of_steps(start, end, stepsize)
+        length = jnp.asarray(stepsize, ts.dtype)
     min_at_end = 16 * eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
-    limits = Limits(start, end, floor, min_at_end, steps, rtol, atol, y0)
-    search = None if plan.guards is None else Search.begin(values, values < -levels, jnp.asarray(length, ts.dtype))
+    limits = Limits(start, end, floor, min_at_end, length, rtol, atol, y0)
+    search = None if plan.guards is None else Search.begin(values, values < -levels, length)
     sums = no_sums(plan.structure(y0))
     if isinstance(control, AdaptiveSteps):
         # A replay of a motion with events may be as short as the rounding of their times.
@@ -162,11 +164,6 @@ def _iterate(plan: Plan, control, max_steps: int, strides, args, limits: Limits,
     row = reverse.row(state.y, state.t, state.t_next, kept) if strides else ()
     more = is_active(max_steps, limits, after)
     return Iteration(after, active, more, Passed(kept, after.t, dense), state.tried, row)
-
-
-def number_of_steps(start, end, stepsize):
-    """Number of fixed steps, as counted by diffrax's `ConstantStepSize`."""
-    return jnp.ceil((end - start) / jnp.nextafter(stepsize, jnp.inf)).astype(jnp.int32)
 
 
 def _accept(plan: Plan, control, args, limits: Limits, state: State, active, step: Step) -> tuple[State, Array]:
@@ -250,9 +247,8 @@ def _search(
 def _grid_point(limits: Limits, number):
     """End of the fixed step of this number, from one."""
     # From the start of the run, as sums of lengths would carry their rounding on.
-    done = number.astype(limits.end.dtype) / limits.steps.astype(limits.end.dtype)
-    t = limits.start + (limits.end - limits.start) * done
-    return jnp.where((number >= limits.steps) | (t > limits.floor), limits.end, t)
+    t = limits.start + number.astype(limits.end.dtype) * limits.length
+    return jnp.where(t > limits.floor, limits.end, t)
 
 
 @kernel(static=2, derivative=False)
@@ -420,15 +416,10 @@ class LibraryRun(Integrator):
         facts = first_of(cases, RESULTS.successful), state.counts, state.t
         return (jax.vmap(plan.structure)(rows), facts), history
 
-    def number_of_steps(self, ts):
-        """Number of fixed steps, None where their ends do not follow the end of the run."""
-        is_free = isinstance(self.control, AdaptiveSteps) or self.plan.guards is not None
-        return None if is_free else number_of_steps(ts[0], ts[-1], self.stepsize)
-
     def replay(self, history, inputs, direct):
         y0, args, ts = inputs
         ts, places = self._in_order(history, ts)
-        rows = reverse.replay_rows(self.plan, history, ravel_pytree(y0)[0], args, ts, self.number_of_steps(ts))
+        rows = reverse.replay_rows(self.plan, history, ravel_pytree(y0)[0], args, ts)
         return (jax.vmap(self.plan.structure)(rows[places]),)
 
     def _in_order(self, history, ts):
@@ -451,9 +442,7 @@ class LibraryRun(Integrator):
         flat = jax.vmap(lambda y: ravel_pytree(y)[0])(weights[0])
         flat = flat.at[places].set(flat)
         start, structure = ravel_pytree(y0)
-        of_y, of_args, of_ts = reverse.pull(
-            self.plan, history, start, args, ts, self.number_of_steps(ts), flat, perturbed[1:]
-        )
+        of_y, of_args, of_ts = reverse.pull(self.plan, history, start, args, ts, flat, perturbed[1:])
         # The end of a run that has guards is a constant time.
         of_ts = jnp.concatenate([of_ts[:1], of_ts[1:][places][: inputs[2].shape[0] - 1]])
 

@@ -73,12 +73,10 @@ def row(y, t0, t1, kept) -> tuple:
 
 
 class _Ends(NamedTuple):
-    """Constants of the way back: the first step, the ends of the run, and the number of fixed steps or None."""
+    """Constants of the way back: the first step, and the end of the run."""
 
     first: Array
-    start: Array
     end: Array
-    steps: Any
 
 
 class _Cotangents(NamedTuple):
@@ -101,11 +99,11 @@ class _Replay(NamedTuple):
     places: Array  # (2,), where to read the times and the flag of the next step
 
 
-def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tuple[Array, Any, Array]:
+def pull(plan: Plan, history: History, y0, args, ts, rows, varies) -> tuple[Array, Any, Array]:
     """Cotangents of y0, of the leaves of `args` that are to have one (None elsewhere), and of ts.
 
-    **Arguments:** `rows` (nt - 1, n), cotangents of the solution at ts[1:]; `steps`, the number of fixed ones, or None; `varies`:
-    flags of the leaves of `args`, and of the times, that are to have cotangents.
+    **Arguments:** `rows` (nt - 1, n), cotangents of the solution at ts[1:]; `varies`: flags of the leaves of `args`, and of the
+    times, that are to have cotangents.
     """
     moving, times_move = varies
     free, fixed = eqx.partition(args, moving)
@@ -116,7 +114,7 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
 
     def back(first, last, states, cotangents: _Cotangents) -> _Cotangents:
         """Go back through the steps first .. last - 1, which begin from the rows of `states`."""
-        ends = _Ends(first, ts[0], ts[-1], steps)
+        ends = _Ends(first, ts[-1])
         cotangents = cotangents._replace(places=_places(last - 1, first, cotangents.saved))
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
         task = Task(_iterate_back, static)
@@ -185,7 +183,7 @@ def _accumulate(times_move: bool, _, ends: _Ends, cotangents: _Cotangents, read,
     # What nothing depends on gets nothing, even where a step has no derivative.
     asked = kept & ((after != 0).any() | (row != 0).any())
     of_args, of_y, of_t0, of_t1, of_at = jax.tree.map(lambda x: jnp.where(asked, x, 0.0), back)
-    from_start, to_end = (step_share(i, t, ends.end, ends.steps) for i, t in ((step, t0), (step + 1, t1)))
+    to_end = jnp.where(t1 >= ends.end, 1.0, jnp.zeros_like(t1))
     saved = cotangents.saved - here.astype(jnp.int32)
     again = here & (saved > 0) & (at_next > t0)
     before = cotangents.before + of_y
@@ -194,20 +192,13 @@ def _accumulate(times_move: bool, _, ends: _Ends, cotangents: _Cotangents, read,
         jnp.where(again, jnp.zeros_like(before), jnp.where(kept, before, cotangents.after)),
         jnp.where(again, before, 0.0),
         [total + x for total, x in zip(cotangents.args, of_args, strict=True)],
-        cotangents.start + of_t0 * (1 - from_start) + of_t1 * (1 - to_end),
-        cotangents.end + of_t0 * from_start + of_t1 * to_end,
+        cotangents.start + of_t0 + of_t1 * (1 - to_end),
+        cotangents.end + of_t1 * to_end,
         cotangents.ts.at[cotangents.saved].add(jnp.where(here, of_at, 0.0)) if times_move else cotangents.ts,
         saved,
         _places(following, step - cotangents.places[0], saved),
     )
     return Iteration(state, active, following >= ends.first)
-
-
-def step_share(i, t, end, steps):
-    """Share of a change of the run's end in the end t of step i, counted from one; the rest of 1 is that of the start."""
-    one = jnp.ones_like(t)
-    share = jnp.zeros_like(t) if steps is None else jnp.where(i < 2, 0.0, i.astype(t.dtype) / steps.astype(t.dtype))
-    return jnp.where(t >= end, one, share)
 
 
 def _pull_without_loop(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
@@ -242,29 +233,28 @@ def _iterate_replay(plan: Plan, args, ends, replay: _Replay, read) -> Iteration:
     return Iteration(state, step < last, step + 1 < last, None, step - first, (replay.y,))
 
 
-def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
+def replay_rows(plan: Plan, history: History, y0, args, ts):
     """Rows of the state (nt - 1, n) at ts[1:] by the steps of a history; zero where the run did not come to.
 
-    **Arguments:** `y0` (n,), flat; `steps`, the number of fixed ones, or None.
+    **Arguments:** `y0` (n,), flat.
     """
-    times, kept, count, steps = lax.stop_gradient((history.times, history.kept, history.count, steps))
+    times, kept, count = lax.stop_gradient((history.times, history.kept, history.count))
     room = kept.shape[0]
 
-    def move(i, t):
-        """Time at which step i (from 1) ends or begins, which follows the ends of the run."""
-        share = step_share(i, t, lax.stop_gradient(ts[-1]), steps)
+    def move(t):
+        """Time at which a step ends or begins, which follows the start of the run, or its end."""
         start, end = ts[0] - lax.stop_gradient(ts[0]), ts[-1] - lax.stop_gradient(ts[-1])
-        return t + (1 - share) * start + share * end
+        return t + jnp.where(t >= lax.stop_gradient(ts[-1]), end, start)
 
     @jax.checkpoint
-    def end_of(args, y, i, t0, t1):
-        return differentiable_step(plan, args, move(i, t0), move(i + 1, t1), y)[0]
+    def end_of(args, y, t0, t1):
+        return differentiable_step(plan, args, move(t0), move(t1), y)[0]
 
     def advance(y, row):
         i, (t0, t1), is_kept = row
         active = is_kept & (i < count)
         # There is room for many more steps than were taken: the rest is skipped, together for a batch.
-        after = cond(active, end_of, lambda args, y, *_: y, args, y, i, t0, t1)
+        after = cond(active, end_of, lambda args, y, *_: y, args, y, t0, t1)
         return jnp.where(active, after, y), y
 
     number = jnp.arange(room, dtype=count.dtype)
@@ -276,7 +266,7 @@ def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
         known = lax.stop_gradient(t)
         holds = taken & (times[:, 0] < known) & (known <= times[:, 1])
         i = jnp.argmax(holds)
-        t0, t1 = move(i, times[i, 0]), move(i + 1, times[i, 1])
+        t0, t1 = move(times[i, 0]), move(times[i, 1])
         _, shift, _, raw, stages = differentiable_step(plan, args, t0, t1, states[i])
         at = dense_output(plan, None, t, t0, t1, states[i], raw, stages, shift)
         return jnp.where(holds.any(), at, jnp.zeros_like(at))
