@@ -75,7 +75,7 @@ def call_executable(function: Callable, args: tuple, kwargs: dict, options: Call
                 return None
             kinds.append((x.shape, x.dtype, x.weak_type))
             arrays.append(x)
-        elif isinstance(x, (np.ndarray, np.generic)):
+        elif isinstance(x, (np.ndarray, np.generic)) and not isinstance(x, str):
             kinds.append((x.shape, jax.dtypes.canonicalize_dtype(x.dtype), False))
             arrays.append(x)
         else:
@@ -217,6 +217,8 @@ def _compile(function: Callable, options: Callable) -> Callable:
             found = call_executable(function, args, kwargs, options)
             if found is not None:
                 return found
+        # To equinox, strings of NumPy are arrays.
+        args, kwargs = jax.tree.map(lambda x: str(x) if isinstance(x, str) else x, (args, kwargs))
         # JAX refuses compiler options under a transformation such as `grad`, whose arguments are traced.
         if not (is_glue and is_concrete((args, kwargs))):
             return usual(*args, **kwargs)

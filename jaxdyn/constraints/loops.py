@@ -29,6 +29,7 @@ from jaxdyn.model.arguments import (
     as_number,
     check_body,
     check_flag,
+    check_name,
     check_new_name,
 )
 from jaxdyn.model.host_math import pose_leaf
@@ -180,7 +181,7 @@ def loop(
         raise ValueError(f"{what}: both frames are on {body_a or 'the world'!r}; name two different bodies")
     return Loop(
         name=name,
-        joint=joint,
+        joint=str(joint),
         body_a=check_body(body_a, f"{name!r}: body_a"),
         body_b=check_body(body_b, f"{name!r}: body_b"),
         in_plane=in_plane,
@@ -284,9 +285,8 @@ def gear(joint_a: str, joint_b: str, ratio: Numbers, offset: Numbers = 0.0, *, n
         raise ValueError(f"gear: both joints are {joint_a!r}; name two different ones")
     name = check_new_name(name, f"gear {joint_a}-{joint_b}")
     what = f"{name!r}: "
-    return Gear(
-        name, joint_a, joint_b, as_float(ratio, what + "ratio", (), float), as_float(offset, what + "offset", (), float)
-    )
+    joints = (check_name(joint, what + "joint") for joint in (joint_a, joint_b))
+    return Gear(name, *joints, as_float(ratio, what + "ratio", (), float), as_float(offset, what + "offset", (), float))
 
 
 class JointLock(Constraint):
@@ -324,7 +324,7 @@ def lock_joint(joint: str, value: Numbers = 0.0, *, name: str | None = None) -> 
     array = jnp.atleast_1d(as_float(value, f"lock_joint {joint!r}: value", None, float))
     if is_concrete(value) and not np.isfinite(np.asarray(value, float)).all():
         raise ValueError(f"lock_joint {joint!r}: value is {value}; give finite numbers")
-    return JointLock(check_new_name(name, f"lock {joint}"), joint, array)
+    return JointLock(check_new_name(name, f"lock {joint}"), check_name(joint, "lock_joint: joint"), array)
 
 
 def model_couplings(model: Model) -> tuple[Gear, ...]:

@@ -120,7 +120,7 @@ def check_name(name: object, what: str) -> str:
     """Check that something is named by a string. **Raises:** ValueError."""
     if not isinstance(name, str):
         raise ValueError(f"{what} is {name!r}; give its name, a string")
-    return name
+    return str(name)  # equinox takes strings of NumPy for arrays
 
 
 def check_names(names: object, what: str) -> tuple[str, ...]:
@@ -143,7 +143,7 @@ def check_new_name(name: object, default: str, what: str = "name") -> str:
         return default
     if not isinstance(name, str) or not name:
         raise ValueError(f"{what} is {name!r}; give a non-empty string, or None for {default!r}")
-    return name
+    return str(name)
 
 
 def check_flag(value: object, what: str) -> bool:

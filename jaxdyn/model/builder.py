@@ -162,9 +162,11 @@ class ModelBuilder:
                 f"{what}: lower limit {lower} is above upper limit {upper}; swap them, or leave both out where there is no "
                 "limit, which is how other simulators read such a pair"
             )
+        # Equinox takes strings of NumPy for arrays.
+        name, joint, joint_name = str(name), str(joint), str(joint_name)
         body = _Body(
             name,
-            parent,
+            None if parent is None else str(parent),
             joint,
             joint_name,
             host_math.pose_matrix(pose, f"{what}: pose"),

@@ -605,3 +605,21 @@ def test_a_motion_that_starts_where_a_gimbal_locks_says_so():
     near = result(jnp.asarray(1.57))
     assert bool(near.success)
     np.testing.assert_allclose(near.energy, near.energy[0], rtol=1e-7)  # rates of 1e3 amplify the tolerance
+
+
+def test_strings_of_numpy_are_names():
+    """Names and kinds out of an array of NumPy give the model and the results of Python's strings."""
+
+    def energies(text):
+        builder = jd.ModelBuilder("pair")
+        for name, parent, kind in (("a", None, "spherical"), ("b", "a", "revolute")):
+            parent = None if parent is None else text(parent)
+            builder.add_body(text(name), parent, text(kind), (1.0, (0.0, 0.1, 0.2), (0.1, 0.1, 0.1)))
+        model = builder.build()
+        q = jd.random_configuration(model, jax.random.key(0))
+        scene = jd.Scene(model, [jd.constraints.lock_joint(text("b_joint"), q[-1:], name=text("lock"))])
+        options = {"outputs": (text("energy"), jd.simulation.Pose(text("b"))), "adjoint": text("forward")}
+        motion = jd.simulate(scene, q, jnp.ones(4).at[3].set(0.0), jnp.array([0.0, 0.1]), stepsize=0.05, **options)
+        return jax.tree.structure(model), motion.energy, motion.poses["b"]
+
+    assert jax.tree.all(jax.tree.map(np.array_equal, energies(str), energies(np.str_)))
