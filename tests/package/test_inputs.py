@@ -88,7 +88,7 @@ TAKES = [
     *((name, CHAIN, *call) for name, call in OF_SCENES.items()),
 ]
 # Arguments that select a program: names, kinds and tolerances.
-ONES = jnp.ones(3)
+ONES, Q2 = jnp.ones(3), jnp.ones(2)
 ARRAYS_FOR_STATIC = {
     "tip": lambda x: jd.newton_euler_matrices(ARM, jnp.zeros(2), jnp.zeros(2), tip=x),
     "frame": lambda x: jd.frame_jacobian(ARM, jnp.zeros(2), x),
@@ -457,6 +457,39 @@ def hybrid(task, of="position", target=(0.0,), **options):
 
 def _raises(q, v, t):
     raise KeyError("of the law")
+
+
+RETURNS = {
+    "constraint 'own': the returned phi": lambda f: jd.Holonomic(lambda q, t: f(q), name="own").position(ARM, Q2, 0.0),
+    "constraint 'own': the returned A": lambda f: jd.Pfaffian(lambda q, t: f(q), name="own").velocity(ARM, Q2, Q2, 0.0),
+    "constraint 'own': the returned b": lambda f: jd.Pfaffian(
+        lambda q, t: q, lambda q, t: f(q)[:1], name="own"
+    ).velocity(ARM, Q2, Q2, 0.0),
+    "bias_force": lambda f: jd.bias_force(jd.ExplicitSystem(lambda q: jnp.eye(2), lambda q, v: f(q), 2), Q2, Q2),
+    "metric": lambda f: jd.geometry.flat(lambda q: f(jnp.eye(2)), Q2, Q2),
+    "field": lambda f: jd.geometry.pull_back(f, lambda s: s)(Q2),
+    "immersion": lambda f: jd.geometry.pull_back(lambda q: q, f)(Q2),
+    "surface: f": lambda f: jd.contact.Parametrised(lambda a: f(jnp.ones(3))).point(Q2),
+    "RayleighDissipation: function": lambda f: jd.forces.RayleighDissipation(lambda q, v, t: f(v)[0])(ARM, Q2, Q2, 0.0),
+}
+
+
+@pytest.mark.parametrize(("name", "call"), RETURNS.items())
+def test_complex_results_of_functions_are_refused(name, call):
+    """A cast to real numbers dropped the imaginary part without a word."""
+    with pytest.raises(ValueError, match=f"^{name} is complex"):
+        call(lambda x: x.astype(complex))
+
+
+def test_functions_may_return_lists_of_numbers():
+    """Within a trace they ended in JAX's error on arrays of numpy."""
+    zero = jnp.zeros(2)
+    spring = lambda system, q, v, t: [-q[0], -2.0 * q[1]]  # noqa: E731
+    held = jd.ExplicitSystem(lambda q: [[2.0 + q[0], 0.0], [0.0, 4.0]], lambda q, v: [q[0], q[1]], 2)
+    same(jax.jit(lambda q: jd.forward_dynamics(held, q, zero, zero))(Q2), -Q2 / jnp.asarray([3.0, 4.0]))
+    pulled = jd.constrained_dynamics(jd.Scene(held, forces=[spring]), Q2, zero).acceleration
+    same(pulled, jnp.asarray([-2.0 / 3.0, -0.75]))
+    same(jd.geometry.flat(lambda q: [[q[0], 0.0], [0.0, q[1]]], Q2, 3 * Q2), 3 * Q2)
 
 
 @pytest.mark.parametrize("way", ["simulate", "stepper"])
