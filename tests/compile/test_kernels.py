@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax._src.lax import lax as of_jax
 from kernel_helpers import native, quick, refuse
 
 from jaxdyn import compile as backend
@@ -111,7 +112,8 @@ UNARY = {
     "integer_pow": lambda x: x**5, "inverse": lambda x: x**-3, "copy": partial(jnp.array, copy=True),
 }  # fmt: skip
 POSITIVE = {  # of numbers between 0 and 1
-    "sqrt": jnp.sqrt, "rsqrt": lax.rsqrt, "log": jnp.log, "log1p": jnp.log1p, "asin": jnp.arcsin, "acos": jnp.arccos,
+    "sqrt": jnp.sqrt, "rsqrt": lax.rsqrt, "log": jnp.log, "log1p": jnp.log1p, "log2": jnp.log2, "asin": jnp.arcsin,
+    "acos": jnp.arccos,
 }  # fmt: skip
 BINARY = {
     "add": jnp.add, "sub": jnp.subtract, "mul": jnp.multiply, "div": jnp.divide, "max": jnp.maximum, "min": jnp.minimum,
@@ -173,6 +175,16 @@ def _own_vjp(x):
 
 _own_vjp.defvjp(lambda x: (3 * x, None), lambda _, g: (7 * g,))
 
+
+@jax.custom_vjp
+def _constant_with_a_rule():
+    return jnp.ones(())
+
+
+_constant_with_a_rule.defvjp(lambda: (jnp.ones(()), None), lambda _, __: ())
+
+# Comparisons of the total order, which jax has since 0.12.
+ORDERS = [getattr(of_jax, name) for name in ("lt_to_p", "le_to_p") if hasattr(of_jax, name)]
 PLACES = np.array([2, 0, 2])
 PAIRS = np.array([[1, 2], [0, 3], [1, 2]])
 MASK = np.array([True, False, True, True])
@@ -188,6 +200,7 @@ def _scanned(x, reverse=False):
 
 OPERATIONS = {
     "comparisons": lambda x: (x > 0, x >= x[:, :1], x < 0.1, x <= 0.1, x == x[:1, :1], x != x[:1, :1], jnp.isfinite(x)),
+    "total order": lambda x: (x, *(order.bind(x, x[::-1]) for order in ORDERS)),
     "logic": lambda x: ((x > 0) & (x < 1), (x > 0) | (x < -1), ~(x > 0)),
     "compared flags": lambda x: ((x > 0) == (x < 1), (x > 0) < (x < 1), (x > 0) >= (x < 1)),
     "flags": lambda x: (jnp.maximum(x > 0, x > 1), jnp.minimum(x > 0, x > 1), (x > 0).max(), (x > 0).sum()),
@@ -204,6 +217,7 @@ OPERATIONS = {
     "joins": lambda x: (jnp.concatenate([x, x + 1]), jnp.stack([x, 2 * x], 1), jnp.split(x, 2, 1), jnp.unstack(x)),
     "pad": lambda x: (lax.pad(x, 0.5, [(1, 2, 0), (0, 0, 1)]), jnp.pad(x, 1)),
     "broadcast": lambda x: (jnp.broadcast_to(x, (2, 3, 4)), x[:, None] + x[None], jnp.full((2, 2), x[0, 0])),
+    "polynomial": lambda x: lax.polynomial(x[0], [1.0, x[1], -2.0]) if hasattr(lax, "polynomial") else x,  # since 0.12
     "iota": lambda x: jnp.arange(12.0).reshape(3, 4) + x,
     "gather": lambda x: (x[PAIRS[:, 0], PAIRS[:, 1]], x[PLACES], x[:, PLACES], x[-1], x[PLACES[:, None], PLACES[None]]),
     "take": lambda x: (jnp.take(x, PLACES, 1), jnp.take_along_axis(x, PAIRS, 1), x.at[PLACES, 9].get(mode="clip")),
@@ -225,6 +239,7 @@ OPERATIONS = {
     "while": lambda x: lax.while_loop(lambda s: s[0] < 4, lambda s: (s[0] + 1, s[1] * 0.9), (0, x)),
     "cond": lambda x: (lax.cond(np.asarray(True), jnp.sin, jnp.cos, x), lax.switch(np.asarray(1), [jnp.sin, jnp.tan], x)),
     "inner": lambda x: (jax.checkpoint(jnp.sin)(x), jax.jit(jnp.cos)(x), _own_jvp(x), lax.stop_gradient(x)),
+    "reverse rule": lambda x: x + _constant_with_a_rule(),
     "barrier": lambda x: lax.optimization_barrier((x, 2 * x)),
     "derivatives": lambda x: (jax.grad(lambda x: jnp.sum(jnp.sin(x) * x**2))(x), jax.hessian(lambda z: (z**3).sum())(x[0])),
     "linear solve": lambda x: lax.custom_linear_solve(
@@ -746,13 +761,11 @@ def test_modes(monkeypatch):
     with backend.compilation("auto"):
         assert has_kernel()
     monkeypatch.setenv("JAXDYN_COMPILATION", "fast")
-    with pytest.raises(
-        ValueError, match="environment's JAXDYN_COMPILATION is 'fast'; choose from 'auto', 'native', 'plain'"
-    ):
+    with pytest.raises(ValueError, match="JAXDYN_COMPILATION is 'fast'"):
         has_kernel()
     for wrong in ("machine", ""):
         with (
-            pytest.raises(ValueError, match=r"compilation: mode is .*'auto', 'native', 'plain'"),
+            pytest.raises(ValueError, match="mode is .*'native'"),
             backend.compilation(wrong),
         ):
             pass
@@ -899,7 +912,7 @@ def test_a_kernel_that_is_missing_is_said():
     slot = next(entry for entry in target._table if entry.hash == number)
     slot.hash = 1  # nobody's
     try:
-        with pytest.raises(jax.errors.JaxRuntimeError, match="compiled by another process"):
+        with pytest.raises(jax.errors.JaxRuntimeError, match="by another process"):
             jax.block_until_ready(run(x))
     finally:
         slot.hash = number

@@ -238,7 +238,7 @@ def test_rows_that_contradict_each_other_give_a_status(tmp_path):
         lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration, q + 0.5, v * 0, q, name="crossing"
     )
     assert jd.constrained_dynamics(scene, *map(jnp.asarray, (q, v, q))).result == jd.RESULTS.contradictory_rows
-    with pytest.raises(FloatingPointError, match="crossing: no regular solution at this sample"):
+    with pytest.raises(FloatingPointError, match="no regular solution"):
         exported(q, v, q)
     exported.save(tmp_path)
     assert "1 where the sample has no regular solution" in (tmp_path / "crossing.h").read_text()
@@ -405,7 +405,7 @@ def test_a_step_of_an_arm_behind_drives(tmp_path):
     exported.save(tmp_path)
     run_c(tmp_path, "driven")
     limited = jd.stepper(jd.Scene(scene.system, forces=(*forces, jd.forces.EffortLimits(0.8))), 0.004)
-    with pytest.raises(ValueError, match=r"its steps end at the kinks of .*leave these forces out"):
+    with pytest.raises(ValueError, match="leave these forces out"):
         jd.export(lambda q, v, z, tau: limited((q, v, z), tau), q, v, z, tau, name="limited")
 
 
@@ -431,9 +431,7 @@ def test_jacobians_by_columns_equal_those_that_are_written_out(arm, exported, mo
 
 def test_jax_export_says_what_to_do(arm):
     function = jax.jit(lambda q: jd.gravity_force(arm, q))
-    with pytest.raises(
-        ValueError, match=r"within jd.compilation\('plain'\), or write an object file for C with jd.export"
-    ):
+    with pytest.raises(ValueError, match=r"jd.compilation\('plain'\), .*jd.export"):
         jax.export.export(function)(STATE[0])
     with jd.compilation("plain"):
         plain = jax.export.export(function)(STATE[0])
@@ -618,7 +616,7 @@ def test_names_that_meet_others(tmp_path):
 def test_doubles_without_double_precision_are_refused():
     jax.config.update("jax_enable_x64", False)
     try:
-        with pytest.raises(ValueError, match=r"examples: x has dtype float64, and JAX computes in float32 here"):
+        with pytest.raises(ValueError, match="x has dtype float64"):
             jd.export(lambda x: 2 * x, X, name="f")
         assert jd.export(lambda x: 2 * x, X.astype(np.float32), name="f")(X.astype(np.float32)).dtype == np.float32
     finally:
@@ -634,7 +632,7 @@ def test_refusals_of_saving_and_calling(exported, tmp_path):
     with pytest.raises(ValueError, match="cannot be written"):
         exported.save(tmp_path / "file" / "folder")
     assert not (tmp_path / "a").exists()
-    with pytest.raises(ValueError, match=r"an argument has shape \(3,\), the example had \(7,\)"):
+    with pytest.raises(ValueError, match=r"shape \(3,\), .*\(7,\)"):
         exported(X[:3], V, TAU)
     os.chmod(tmp_path, 0o500)
     if not os.access(tmp_path, os.W_OK):  # root may write everywhere
@@ -642,9 +640,9 @@ def test_refusals_of_saving_and_calling(exported, tmp_path):
             exported.save(tmp_path)
     os.chmod(tmp_path, 0o700)
     assert sorted(x.name for x in tmp_path.iterdir()) == ["file"], "nothing is half written"
-    with pytest.raises(ValueError, match="takes 3 arguments, and was given 2"):
+    with pytest.raises(ValueError, match="takes 3 .*given 2"):
         exported(X, V)
-    with pytest.raises(ValueError, match="was exported without its Jacobian"):
+    with pytest.raises(ValueError, match="without its Jacobian"):
         jd.export(lambda x: x, X, name="f").jacobian(X)
 
 

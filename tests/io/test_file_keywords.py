@@ -28,9 +28,9 @@ def test_dtypes_bases_and_gravity(tmp_path):
     )
     for read in readers:
         assert read(jnp.float32).home.dtype == np.float32 and read(jnp.float64).home.dtype == np.float64
-    with pytest.warns(DeprecationWarning, match=r"jd\.io\.load_sdf is deprecated; call load"):
+    with pytest.warns(DeprecationWarning, match="load_sdf is deprecated"):
         assert jd.io.load_sdf(tmp_path / "m.sdf").system.nv == 7
-    with pytest.warns(DeprecationWarning, match="load_urdf is deprecated; call load_model"):
+    with pytest.warns(DeprecationWarning, match="load_urdf is deprecated"):
         assert jd.load_urdf(tmp_path / "r.urdf").nv == 1
     assert jd.load_model(tmp_path / "m.sdf", floating_base=False).nv == jd.load_model(tmp_path / "b.xml").nv == 1
     assert jd.load(tmp_path / "m.sdf", floating_base=False).system.nv == 1

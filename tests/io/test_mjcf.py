@@ -240,11 +240,11 @@ def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):
 def test_controls_of_another_number_are_refused(mixed):
     _, scene = mixed
     q = scene.starts["reference"].q
-    with pytest.raises(ValueError, match=r"control has shape \(2,\), expected \(6,\).*m1, p1"):
+    with pytest.raises(ValueError, match=r"control .*\(6,\).*m1, p1"):
         scene.actuators(scene.system, q, jnp.zeros(scene.nv), jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"activation has shape None, expected \(1,\).*stateful"):
+    with pytest.raises(ValueError, match=r"activation .*\(1,\).*stateful"):
         scene.actuators(scene.system, q, jnp.zeros(scene.nv), jnp.zeros(6))
-    with pytest.raises(ValueError, match=r"activation has shape \(2,\), expected \(1,\)"):
+    with pytest.raises(ValueError, match=r"activation .*\(2,\).*\(1,\)"):
         scene.actuators.drive(lambda q, v, t: jnp.zeros(6), jnp.zeros(2))
 
 

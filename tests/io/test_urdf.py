@@ -181,7 +181,7 @@ def test_features_of_a_joint(urdf):
         '<dynamics damping="0.5" friction="0.25" armature="0.125"/>'
     )
     path = urdf(link("a"), joint("j", "a", "b", inside), link("b"), '<gazebo:thing x="1"/>', "<!-- seen -->")
-    with pytest.warns(jd.io.NotTakenWarning, match="unknown <gazebo:thing> in <robot>: r"):
+    with pytest.warns(jd.io.NotTakenWarning, match="unknown <gazebo:thing>"):
         model = jd.load_model(path, gravity=None)
     assert (model.name, model.gravity, model.joint_names, model.frame_names) == ("r", None, ("j",), ("b", "a"))
     np.testing.assert_allclose(model.screws[0], [0, 0, 0, 0, 0.6, 0.8], atol=1e-16)
@@ -288,7 +288,7 @@ def test_mimic_joints():
     ]
     np.testing.assert_array_equal(model.coupling_values, [[1.0, 0.0]])
     assert model.nv == 9
-    with pytest.raises(ValueError, match=r"panda_finger_joint2 \(follows panda_finger_joint1\); pass mimic='couple'"):
+    with pytest.raises(ValueError, match="panda_finger_joint2 .*mimic='couple'"):
         jd.load_model(panda, mimic="error")
     with pytest.raises(ValueError, match="mimic is 'follow'"):
         jd.load_model(panda, mimic="follow")
@@ -301,7 +301,7 @@ def test_mimic_joints():
     assert jd.load_model(panda, lock=["panda_finger_joint1"]).nv == 8
     with pytest.raises(ValueError, match="'panda_finger_joint2' follows 'panda_finger_joint1'"):
         jd.load_model(panda, mimic="couple", lock=["panda_finger_joint2"])
-    with pytest.raises(ValueError, match=r"'panda_finger_joint2' is held at .*0.01.* but follows"):
+    with pytest.raises(ValueError, match="'panda_finger_joint2' is held at"):
         jd.load_model(panda, mimic="couple", lock={"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.01})
 
 
@@ -445,9 +445,9 @@ def test_bad_arguments(urdf, tmp_path):
     for value, message in {(1.0, 2.0): r"has shape \(2,\)", np.nan: "nan.*finite", "up": "'up', expected"}.items():
         with pytest.raises(ValueError, match=f"value of joint 'elbow'.*{message}"):
             jd.load_model(path, lock={"elbow": value})
-    with pytest.raises(ValueError, match=r"its quaternion .* is zero"):
+    with pytest.raises(ValueError, match="quaternion .* is zero"):
         jd.load_model(path, floating_base=True, lock={"root_joint": np.zeros(7)})
-    with pytest.raises(ValueError, match=r"nowhere.urdf' cannot be read .*check the path"):
+    with pytest.raises(ValueError, match="nowhere.urdf' .*check the path"):
         jd.load_model(tmp_path / "nowhere.urdf")
     with pytest.raises(ValueError, match="cannot be read"):
         jd.load_model(tmp_path)
@@ -724,14 +724,14 @@ def test_xacro_files_are_expanded(tmp_path, monkeypatch):
         with pytest.raises(ValueError, match=f"{path}: xacro: .*{words}.*arguments="):
             jd.load(path)
     path.write_text(XACRO.replace('"2"', '"two"'))
-    with pytest.raises(ValueError, match=r"arm.urdf.xacro \(expanded\):\d+: value of <mass> of link 'b' is 'two'"):
+    with pytest.raises(ValueError, match=r"xacro \(expanded\):\d+: .* 'two'"):
         jd.load(path)
     monkeypatch.setitem(sys.modules, "xacro", None)
     with pytest.raises(ImportError, match=r"arm.urdf.xacro.*pip install jaxdyn\[xacro\]"):
         jd.load(path)
     plain = path.with_name("arm.urdf")
     plain.write_text("<robot name='a'><link name='b'/></robot>")
-    with pytest.raises(ValueError, match=r"arguments is .*no .xacro file"):
+    with pytest.raises(ValueError, match="arguments .*no .xacro"):
         jd.load(plain, arguments={"length": 1})
 
 
@@ -765,7 +765,7 @@ def test_arms_without_inertias_load_for_kinematics(tmp_path):
     """The error names the option, which counts for links that move; kinematics do not depend on it."""
     path = tmp_path / "arm.urdf"
     path.write_text(ARM_WITHOUT_INERTIAS)
-    with pytest.raises(ValueError, match=r"moves no inertia.*missing_inertia=jd.inertia.sphere\(1.0, 0.1\)"):
+    with pytest.raises(ValueError, match=r"missing_inertia=jd.inertia.sphere\(1.0, 0.1\)"):
         jd.load_model(path)
     ball = jd.inertia.sphere(2.0, 0.1)
     for model in (jd.load_model(path, missing_inertia=ball), jd.load(path, missing_inertia=ball).system):
@@ -823,9 +823,9 @@ def test_packages_of_xacro_files_without_ros(tmp_path):
         jd.load_model(path)
     np.testing.assert_allclose(jd.load_model(path, packages={"elsewhere": str(tmp_path / "parts")}).inertias[0, 0], 3.0)
     assert jd.io.urdf_inertia_report(path, packages={"elsewhere": tmp_path / "parts"}) == []  # the arm's inertia is one
-    with pytest.raises(ValueError, match=r"packages\['elsewhere'\] is 'nowhere', which is no folder"):
+    with pytest.raises(ValueError, match=r"packages\['elsewhere'\] is 'nowhere'"):
         jd.load_model(path, packages={"elsewhere": "nowhere"})
     other = tmp_path / "r.urdf"
     other.write_text("<robot name='r'><link name='a'/></robot>")
-    with pytest.raises(ValueError, match=r"packages is .* is no \.xacro file"):
+    with pytest.raises(ValueError, match=r"packages .*no \.xacro"):
         jd.load_model(other, packages={"a": "b"})

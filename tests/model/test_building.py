@@ -253,7 +253,7 @@ def test_bad_frames_couplings_and_settings():
         builder.add_coupling("a_joint", "b_joint")
     with jax.enable_x64(False):
         assert built().home.dtype == jnp.float32
-        with pytest.raises(ValueError, match="dtype is float64, but jax runs in 32 bits"):
+        with pytest.raises(ValueError, match="float64, .*32 bits"):
             jd.ModelBuilder(dtype=jnp.float64)
 
 
@@ -560,26 +560,26 @@ def test_numbers_that_are_not_finite_are_refused_with_their_body(bad):
     else:
         with pytest.raises(ValueError, match="replace: upper of joint 'b_joint'"):
             sound.replace(upper=upper)
-    with pytest.raises(ValueError, match=r"body 'b': inertia: mass 1e\+308 kg at .* overflows"):
+    with pytest.raises(ValueError, match="'b': .* overflows"):
         jd.ModelBuilder().add_body("b", inertia=(1e308, (10, 0, 0), (1, 1, 1)))
 
 
 @pytest.mark.parametrize("text", ["1_0", "1", 1j])
 def test_texts_are_no_numbers(text):
-    with pytest.raises(ValueError, match=r"body 'a': inertia: mass is .*, expected a number"):
+    with pytest.raises(ValueError, match="'a': .*expected a number"):
         jd.ModelBuilder().add_body("a", inertia=(text, (0, 0, 0), (1, 1, 1)))
 
 
 def test_swapped_arguments_of_inertias_are_named():
     ball = jd.inertia.sphere(1.0, 0.1)
-    with pytest.raises(ValueError, match=r"pose has shape \(10,\), expected pose \(4, 4\), parameters \(10,\)"):
+    with pytest.raises(ValueError, match=r"pose .*\(4, 4\), parameters"):
         jd.inertia.transform_inertia(ball, jnp.eye(4))
-    with pytest.raises(ValueError, match=r"parameters has shape \(3,\), expected parameters \(10,\), position \(3,\)"):
+    with pytest.raises(ValueError, match=r"parameters .*\(10,\), position"):
         jd.inertia.displaced(jnp.zeros(3), ball)
-    with pytest.raises(ValueError, match=r"com has shape \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"com .*\(3, 3\)"):
         jd.inertia.inertial_parameters(1.0, jnp.eye(3), jnp.zeros(3))
     for function in (jd.inertia.spatial_inertia, jd.inertia.pseudo_inertia, jd.inertia.to_log_cholesky):
-        with pytest.raises(ValueError, match=r"parameters has shape \(4, 4\), expected parameters \(10,\)"):
+        with pytest.raises(ValueError, match=r"parameters .*\(10,\)"):
             function(jnp.eye(4))
 
 
@@ -597,7 +597,7 @@ def test_a_motion_that_starts_where_a_gimbal_locks_says_so():
 
     for angle in (np.pi / 2, -np.pi / 2):
         assert result(jnp.asarray(angle)).result == jd.RESULTS.singular_mass_matrix
-    with pytest.raises(RuntimeError, match=r"not positive definite.* Fix: give massless bodies an inertia"):
+    with pytest.raises(RuntimeError, match="not positive definite"):
         jd.simulate(model, [0.1, np.pi / 2, 0.2], v, [0.0, 0.1])
     codes = jax.jit(jax.vmap(lambda angle: result(angle).success))(jnp.asarray([np.pi / 2, 0.3]))
     assert codes.tolist() == [False, True]

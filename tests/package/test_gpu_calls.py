@@ -269,7 +269,7 @@ def test_an_error_without_a_name_has_its_number(gpu, monkeypatch):
 
 def test_the_assembler_says_what_it_refuses(gpu, monkeypatch):
     monkeypatch.setattr(gpu, "refusal", b"ptxas error : line 3")
-    with pytest.raises(jax.errors.JaxRuntimeError, match=r"cuModuleLoadDataEx of .*: ptxas error : line 3"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match="ptxas error : line"):
         doubled(46.0)(jnp.ones((3, 2)))
 
 
@@ -295,11 +295,11 @@ def test_a_kernel_of_another_process_is_an_error(gpu):
     entries = {number: kernel.entry for number, kernel in device._kernels.items()}
     for entry in entries.values():
         entry.hash = 0
-    with pytest.raises(ValueError, match="compiled by another process"):
+    with pytest.raises(ValueError, match="by another process"):
         call(x)
     for number, entry in entries.items():
         entry.hash, entry.buffers = number, entry.buffers + 1
-    with pytest.raises(ValueError, match="another size than the kernel was written for"):
+    with pytest.raises(ValueError, match="another size than"):
         call(x)
     for entry in entries.values():
         entry.buffers -= 1
@@ -327,7 +327,7 @@ def test_what_takes_too_much_memory_runs_on_jax_after_a_warning(gpu, caplog):
 def test_a_build_of_llvm_without_the_target_is_unsupported(monkeypatch):
     monkeypatch.setattr(ptx, "_TRIPLE", "nvptx128-nobody-here")
     monkeypatch.setattr(ptx, "_target", ptx._target.__wrapped__)
-    with pytest.raises(jax_adapter.Unsupported, match="LLVM has no target for NVIDIA's GPUs"):
+    with pytest.raises(jax_adapter.Unsupported, match="LLVM has no target"):
         ptx.ptx_of("", 90)
 
 
@@ -362,7 +362,7 @@ def test_the_driver_is_found_under_its_names(monkeypatch):
     monkeypatch.setattr(device.sys, "platform", "linux")
     assert device.open_library() == "libcuda.so" and asked == ["libcuda.so.1", "libcuda.so"]
     monkeypatch.setattr(device.ctypes, "CDLL", find)
-    with pytest.raises(jax_adapter.Unsupported, match=r"CUDA's driver is not installed \(libcuda\.so\.1\)"):
+    with pytest.raises(jax_adapter.Unsupported, match=r"not installed \(libcuda\.so\.1\)"):
         device.open_library()
     monkeypatch.setattr(device.sys, "platform", "win32")
     with pytest.raises(jax_adapter.Unsupported, match=r"nvcuda\.dll"):

@@ -144,7 +144,7 @@ def test_numbers_of_any_kind_give_those_of_the_model(system, function, args):
 def test_what_does_not_fit_is_refused_with_its_name(system, function, args):
     for i in range(len(args)):
         for wrong in (jnp.asarray(args[i], complex), "abc"):
-            with pytest.raises(ValueError, match=r"is complex|pass an array of numbers|pass one"):
+            with pytest.raises(ValueError, match="is complex|array of numbers|pass one"):
                 function(system, *args[:i], wrong, *args[i + 1 :])
     if function is not OF_BODIES["regressor"][0]:
         with pytest.raises(ValueError, match=r"has shape \(2, .*vmap"):
@@ -153,13 +153,13 @@ def test_what_does_not_fit_is_refused_with_its_name(system, function, args):
 
 @pytest.mark.parametrize(("name", "call"), (OF_BODIES | OF_SYSTEMS).items())
 def test_functions_of_a_system_say_what_to_pass_for_a_scene(name, call):
-    with pytest.raises(ValueError, match=r"is a Scene; pass scene\.system"):
+    with pytest.raises(ValueError, match=r"pass scene\.system"):
         call[0](CHAIN, *call[1:])
 
 
 @pytest.mark.parametrize(("name", "call"), OF_BODIES.items())
 def test_functions_of_bodies_refuse_other_systems(name, call):
-    with pytest.raises(ValueError, match="MetricSystem, which has no bodies"):
+    with pytest.raises(ValueError, match="has no bodies"):
         call[0](PLANE, *call[1:])
 
 
@@ -169,25 +169,25 @@ def test_functions_of_a_scene_take_a_system_as_one(name, call):
     if name in ("constrained_dynamics", "simulate", "stiffness"):
         same(call[0](ARM, *call[1:]), call[0](jd.Scene(ARM), *call[1:]))
     else:
-        with pytest.raises(ValueError, match=r"the scene has no constraints"):
+        with pytest.raises(ValueError, match="has no constraints"):
             call[0](ARM, *call[1:])
 
 
 def test_a_scene_is_no_system_of_another():
-    with pytest.raises(ValueError, match=r"system is a Scene; pass scene\.system"):
+    with pytest.raises(ValueError, match=r"pass scene\.system"):
         jd.Scene(CHAIN)
     with pytest.raises(ValueError, match="system is a str"):
         jd.Scene("arm")
 
 
 def test_a_batch_without_vmap_is_told_so():
-    with pytest.raises(ValueError, match=r"control returned shape \(4, 2\), expected \(2,\).*jax\.vmap"):
+    with pytest.raises(ValueError, match=r"shape \(4, 2\).*jax\.vmap"):
         jd.simulate(ARM, [0, 0], [0, 0], [0, 1], control=lambda q, v, t: jnp.ones((4, 2)))
-    with pytest.raises(ValueError, match=r"nu has shape \(4, 1\).*jax\.vmap"):
+    with pytest.raises(ValueError, match=r"nu .*jax\.vmap"):
         jd.reduced_dynamics(CHAIN, Q, jnp.ones((4, 1)), basis=(0,))
-    with pytest.raises(ValueError, match=r"multipliers has shape \(4, 1\).*jax\.vmap"):
+    with pytest.raises(ValueError, match=r"multipliers .*jax\.vmap"):
         jd.constraint_forces(CHAIN, Q, jnp.ones((4, 1)))
-    with pytest.raises(ValueError, match=r"stepsize has shape \(2,\).*jax\.vmap"):
+    with pytest.raises(ValueError, match=r"stepsize .*jax\.vmap"):
         jd.simulate(ARM, [0, 0], [0, 0], [0, 1], stepsize=[0.1, 0.2])
 
 
@@ -245,24 +245,24 @@ def test_a_model_without_moving_bodies():
     energies, (mass, matrix), acceleration, centre, momentum = compute()
     assert energies == (0, 0) and mass.shape == (0, 0) and matrix.shape == (6, 0)
     assert acceleration.shape == (0,) and np.isnan(centre).all() and not momentum.any()
-    with pytest.raises(ValueError, match=r"no coordinates \(nq = nv = 0\), so nothing moves"):
+    with pytest.raises(ValueError, match="so nothing moves"):
         jd.simulate(empty, none, none, [0.0, 1.0])
 
 
 def test_forces_that_do_not_fit_are_named():
-    with pytest.raises(ValueError, match=r"forces\[0\] takes \(q, v, t\), but is called as force\(system, q, v, t\)"):
+    with pytest.raises(ValueError, match=r"forces\[0\] takes .*\(system,"):
         jd.simulate(jd.Scene(ARM, forces=(stiffer,)), [0, 0], [0, 0], [0, 1], stepsize=0.1)
 
 
 def test_paths(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     for load in (jd.load_model, jd.load):
-        with pytest.raises(ValueError, match=r"(path|source) is None; pass the path of a file"):
+        with pytest.raises(ValueError, match="(path|source) is None"):
             load(None)
     jd.save_urdf(ARM, "~/arm.urdf")
     assert (tmp_path / "arm.urdf").exists()
     assert jd.load_model("~/arm.urdf").joint_names == ARM.joint_names
-    with pytest.raises(ValueError, match=r"--out nowhere/a\.csv: there is no directory nowhere"):
+    with pytest.raises(ValueError, match="--out .* directory nowhere"):
         output_path("nowhere/a.csv", (".csv",), "--out")
 
 
@@ -401,7 +401,7 @@ def test_motions_start_from_unit_quaternions(modes):
     scene = jd.Scene(model, forces=(jd.contact.DryFriction(0.3, normal=1.0, along=0),) if modes else ())
     starts = jnp.asarray([[1.0, 0, 0, 0], [2.0, 0, 0, 0], [1.0002, 0, 0, 0], [0.0, 0, 0, 0], [jnp.nan, 0, 0, 0]])
     v0, options = jnp.asarray([1.0, 0.2, 0.1]), {"throw": False} | ({} if modes else {"stepsize": 0.05})
-    with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1"):
+    with pytest.raises(ValueError, match="length 2 .*'ball_joint'"):
         jd.simulate(scene, starts[1], v0, [0.0, 0.1], **options)
     run = jax.jit(jax.vmap(lambda q: jd.simulate(scene, q, v0, [0.0, 0.1], **options)))
     computed = run(starts)

@@ -342,7 +342,7 @@ def test_a_store_of_something_else_is_refused_with_what_differs(tmp_path, monkey
     (out / "zarr.json").write_text(json.dumps(old))
     refused("whose format is 0 of jaxdyn and not 3")
     (tmp_path / "c.zarr").mkdir()
-    with pytest.raises(ValueError, match=r"no store of jd\.scale"):
+    with pytest.raises(ValueError, match="no store of"):
         evaluated(tmp_path / "c.zarr")
 
 
@@ -377,7 +377,7 @@ def heavy(p):
 def test_a_full_disk_loses_nothing(small_disk, tmp_path):
     """16 kB a rollout on a disk of 768 kB: it ends with an error that says so, and goes on elsewhere where there is room."""
     out = small_disk / "a.zarr"
-    with pytest.raises(OSError, match=r"its file system is full .*chunks that were finished are kept") as caught:
+    with pytest.raises(OSError, match="full .*finished are kept") as caught:
         evaluated(out, function=heavy, samples=80, chunk=4)
     assert caught.value.errno == errno.ENOSPC
     kept = recorded(out)
@@ -394,7 +394,7 @@ def test_a_full_disk_is_told_wherever_it_is_met(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(stores.Store, "write", full)
-    with pytest.raises(OSError, match=r"a\.zarr', and its file system is full"):
+    with pytest.raises(OSError, match="file system is full"):
         evaluated(tmp_path / "a.zarr")
     monkeypatch.undo()
     assert evaluated(tmp_path / "a.zarr").computed == 23
@@ -557,7 +557,7 @@ def test_blocks_fit_the_memory(tmp_path, monkeypatch):
     assert tight.batch_size < 30 and tight.program_bytes <= 2**20
     assert_equal(arrays(free.out), arrays(tight.out))
     monkeypatch.setattr("jaxdyn.scale.study.available_memory", lambda _: 2000)
-    with pytest.raises(MemoryError, match=r"a program of 2 rollouts needs .* MiB, and .* are allowed"):
+    with pytest.raises(MemoryError, match="2 rollouts needs .*allowed"):
         run("c.zarr")
     assert not (tmp_path / "c.zarr").exists()
 
@@ -616,7 +616,7 @@ def test_reductions_and_states_refuse(tmp_path):
 
 def test_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(ImportError, match=r"jd.scale needs zarr: pip install 'jaxdyn\[scale\]'"):
+    with pytest.raises(ImportError, match=r"zarr: .*jaxdyn\[scale\]"):
         evaluated(tmp_path / "a.zarr")
 
 
@@ -835,7 +835,7 @@ def test_keywords_of_evaluate_and_run(tmp_path):
     np.testing.assert_allclose(run.reductions["mean"]["mean"], np.mean(1 / x), rtol=1e-14)
     assert run.batch_size == 2
     options = {"samples": 6, "seed": 7, "rows": ["z", "parameter_x"], "reductions": {"mean": jd.scale.Mean("z")}}
-    with pytest.warns(DeprecationWarning, match="chunk, progress of jd.scale are now fields"):
+    with pytest.warns(DeprecationWarning, match="chunk, progress .*fields"):
         again = jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", chunk=3, progress=False, **options)
     assert again.computed == 0
     with pytest.raises(TypeError, match="no argument lanes"):

@@ -304,7 +304,7 @@ def test_the_scheduler_killed_and_started_again(whole, tmp_path):
             running.wait_for_chunks(5)
             scheduler.kill()
             scheduler.wait()
-            with pytest.raises(ConnectionError, match=r"did not come back .*what was finished is kept"):
+            with pytest.raises(ConnectionError, match="did not come .*is kept"):
                 running.end()
         kept = recorded(running.out)
         begin()
@@ -405,9 +405,7 @@ def test_a_chunk_that_raises_is_tried_again_and_reported(client, tmp_path, where
     options = {"chunk": 5, "batch_size": 5, "client": client, "progress": False}
     starts = np.arange(40.0)
     function = failing((12.0, 33.0), 2, tmp_path)
-    with pytest.raises(
-        RuntimeError, match=r"of 8 chunks 2 failed in every attempt \(2, 6\), the others are finished"
-    ) as caught:
+    with pytest.raises(RuntimeError, match=r"2 failed .*\(2, 6\)") as caught:
         jd.scale.evaluate(function, starts, out=tmp_path / "a.zarr", resources=jd.scale.Resources(retries=0, **options))
     assert "Chunk 2:\nTraceback" in str(caught.value) and "12.0 is a bad start" in str(caught.value)
     assert recorded(tmp_path / "a.zarr") == 6
@@ -422,9 +420,9 @@ def test_a_chunk_that_raises_is_tried_again_and_reported(client, tmp_path, where
 def test_a_cluster_that_does_not_fit_is_refused(client, tmp_path, monkeypatch):
     out = tmp_path / "a.zarr"
     for other in ("tcp://127.0.0.1:1", object()):
-        with pytest.raises(ValueError, match=r"client is .*; give a dask\.distributed\.Client that is connected"):
+        with pytest.raises(ValueError, match=r"give a dask\.distributed\.Client"):
             evaluate(out, other)
-    with pytest.raises(ValueError, match="devices is given with client"):
+    with pytest.raises(ValueError, match="devices .* client"):
         evaluate(out, client, devices=jax.local_devices())
     told = client.get_versions
 
@@ -454,14 +452,10 @@ def test_a_store_that_workers_do_not_see_is_refused(client, tmp_path):
     """The file that marks the store is moved away for the workers."""
     mark = tmp_path / "a.zarr.owner"
     with Cluster(client, mark=(mark, "a text")) as cluster:
-        with pytest.raises(
-            ValueError, match=r"out is in '.*', which worker tcp://.* does not see \(a\.zarr\.owner: .*No such"
-        ):
+        with pytest.raises(ValueError, match=r"worker tcp://.*a\.zarr\.owner: .*No such"):
             cluster.send(lambda: None)
         mark.write_text("another text")
-        with pytest.raises(
-            ValueError, match=r"another file of that name.*file system that the client and all workers share"
-        ):
+        with pytest.raises(ValueError, match="another file of"):
             cluster.send(lambda: None)
 
 
@@ -470,7 +464,7 @@ def test_a_worker_of_another_version_that_joins_gets_no_task(client, monkeypatch
     monkeypatch.setattr("jaxdyn.tasks.worker.package_versions", lambda: package_versions() | {"jaxdyn": "0.0.1"})
     with (
         Cluster(client) as cluster,
-        pytest.raises(ValueError, match=r"worker tcp://.* and this process 0\.0\.1"),
+        pytest.raises(ValueError, match=r"worker tcp://.* 0\.0\.1"),
     ):
         cluster.send(lambda: None)
 
@@ -627,5 +621,5 @@ def test_without_a_client_no_dask_is_imported(tmp_path, monkeypatch):
     for name in ("dask", "distributed"):
         monkeypatch.setitem(sys.modules, name, None)
     assert evaluate(tmp_path / "a.zarr").success
-    with pytest.raises(ImportError, match=r"client= needs distributed: pip install 'jaxdyn\[scale\]'"):
+    with pytest.raises(ImportError, match=r"distributed: .*jaxdyn\[scale\]"):
         evaluate(tmp_path / "b.zarr", object())
