@@ -765,7 +765,7 @@ def test_modes(monkeypatch):
         has_kernel()
     for wrong in ("machine", ""):
         with (
-            pytest.raises(ValueError, match="mode is .*'native'"),
+            pytest.raises(ValueError, match=r"mode is .*'native'"),
             backend.compilation(wrong),
         ):
             pass

@@ -640,7 +640,7 @@ def test_refusals_of_saving_and_calling(exported, tmp_path):
             exported.save(tmp_path)
     os.chmod(tmp_path, 0o700)
     assert sorted(x.name for x in tmp_path.iterdir()) == ["file"], "nothing is half written"
-    with pytest.raises(ValueError, match="takes 3 .*given 2"):
+    with pytest.raises(ValueError, match=r"takes 3 .*given 2"):
         exported(X, V)
     with pytest.raises(ValueError, match="without its Jacobian"):
         jd.export(lambda x: x, X, name="f").jacobian(X)

@@ -253,7 +253,7 @@ def test_bad_frames_couplings_and_settings():
         builder.add_coupling("a_joint", "b_joint")
     with jax.enable_x64(False):
         assert built().home.dtype == jnp.float32
-        with pytest.raises(ValueError, match="float64, .*32 bits"):
+        with pytest.raises(ValueError, match=r"float64, .*32 bits"):
             jd.ModelBuilder(dtype=jnp.float64)
 
 
@@ -560,13 +560,13 @@ def test_numbers_that_are_not_finite_are_refused_with_their_body(bad):
     else:
         with pytest.raises(ValueError, match="replace: upper of joint 'b_joint'"):
             sound.replace(upper=upper)
-    with pytest.raises(ValueError, match="'b': .* overflows"):
+    with pytest.raises(ValueError, match=r"'b': .* overflows"):
         jd.ModelBuilder().add_body("b", inertia=(1e308, (10, 0, 0), (1, 1, 1)))
 
 
 @pytest.mark.parametrize("text", ["1_0", "1", 1j])
 def test_texts_are_no_numbers(text):
-    with pytest.raises(ValueError, match="'a': .*expected a number"):
+    with pytest.raises(ValueError, match=r"'a': .*expected a number"):
         jd.ModelBuilder().add_body("a", inertia=(text, (0, 0, 0), (1, 1, 1)))
 
 

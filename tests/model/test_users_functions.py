@@ -40,7 +40,7 @@ def test_places_of_joints(tree):
     assert (tree.q_index("j0"), tree.v_index("j4")) == (slice(0, 7), slice(11, 14))
     q = jnp.arange(float(tree.nq))
     assert float(q[tree.q_index("j3")]) == q[tree.topology.q_slices[3]][0]
-    with pytest.raises(ValueError, match="'j9' .*'tree3'"):
+    with pytest.raises(ValueError, match=r"'j9' .*'tree3'"):
         tree.q_index("j9")
 
 
@@ -201,7 +201,7 @@ def test_fixed_joints_name_frames(urdf):
     assert_close(jd.frame_pose(model, q, "mount"), wanted)
     both = jd.join(model, model, prefix=("a_", "b_"))
     assert_close(jd.frame_pose(both, jnp.array([0.4, 0.1]), "a_mount"), wanted)
-    with pytest.raises(ValueError, match="'mount' .*no coordinates"):
+    with pytest.raises(ValueError, match=r"'mount' .*no coordinates"):
         model.v_index("mount")
     with pytest.raises(ValueError, match="did you mean mount"):
         jd.frame_pose(model, q, "mont")
@@ -218,7 +218,7 @@ def test_load_takes_every_format(urdf, tmp_path, monkeypatch):
     assert jd.load(tmp_path / "a.xml").system.joint_names == ("shoulder",)
     with pytest.warns(jd.io.NotTakenWarning):
         assert jd.load(tmp_path / "b.xml").system.joint_names == ("j",)
-    with pytest.raises(ValueError, match="floating_base .*MJCF"):
+    with pytest.raises(ValueError, match=r"floating_base .*MJCF"):
         jd.load(tmp_path / "c.mjcf", floating_base=True)
     with pytest.raises(ValueError, match=r"x\.step: .*known format"):
         jd.load("x.step")
@@ -244,7 +244,7 @@ def test_one_motion_of_a_batch_is_a_log(tmp_path):
         log = jd.read_log(tmp_path / name, rollout=2)
         np.testing.assert_array_equal(log.q, motion.q[1])
         np.testing.assert_array_equal(log.tau, motion.torque[1])
-        with pytest.raises(ValueError, match="2 motions; .*rollout=1"):
+        with pytest.raises(ValueError, match=r"2 motions; .*rollout=1"):
             jd.read_log(tmp_path / name)
         with pytest.raises(ValueError, match="rollout is 3"):
             jd.read_log(tmp_path / name, rollout=3)

@@ -144,7 +144,7 @@ def test_numbers_of_any_kind_give_those_of_the_model(system, function, args):
 def test_what_does_not_fit_is_refused_with_its_name(system, function, args):
     for i in range(len(args)):
         for wrong in (jnp.asarray(args[i], complex), "abc"):
-            with pytest.raises(ValueError, match="is complex|array of numbers|pass one"):
+            with pytest.raises(ValueError, match=r"is complex|array of numbers|pass one"):
                 function(system, *args[:i], wrong, *args[i + 1 :])
     if function is not OF_BODIES["regressor"][0]:
         with pytest.raises(ValueError, match=r"has shape \(2, .*vmap"):
@@ -257,12 +257,12 @@ def test_forces_that_do_not_fit_are_named():
 def test_paths(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     for load in (jd.load_model, jd.load):
-        with pytest.raises(ValueError, match="(path|source) is None"):
+        with pytest.raises(ValueError, match=r"(path|source) is None"):
             load(None)
     jd.save_urdf(ARM, "~/arm.urdf")
     assert (tmp_path / "arm.urdf").exists()
     assert jd.load_model("~/arm.urdf").joint_names == ARM.joint_names
-    with pytest.raises(ValueError, match="--out .* directory nowhere"):
+    with pytest.raises(ValueError, match=r"--out .* directory nowhere"):
         output_path("nowhere/a.csv", (".csv",), "--out")
 
 
@@ -401,7 +401,7 @@ def test_motions_start_from_unit_quaternions(modes):
     scene = jd.Scene(model, forces=(jd.contact.DryFriction(0.3, normal=1.0, along=0),) if modes else ())
     starts = jnp.asarray([[1.0, 0, 0, 0], [2.0, 0, 0, 0], [1.0002, 0, 0, 0], [0.0, 0, 0, 0], [jnp.nan, 0, 0, 0]])
     v0, options = jnp.asarray([1.0, 0.2, 0.1]), {"throw": False} | ({} if modes else {"stepsize": 0.05})
-    with pytest.raises(ValueError, match="length 2 .*'ball_joint'"):
+    with pytest.raises(ValueError, match=r"length 2 .*'ball_joint'"):
         jd.simulate(scene, starts[1], v0, [0.0, 0.1], **options)
     run = jax.jit(jax.vmap(lambda q: jd.simulate(scene, q, v0, [0.0, 0.1], **options)))
     computed = run(starts)

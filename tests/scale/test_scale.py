@@ -377,7 +377,7 @@ def heavy(p):
 def test_a_full_disk_loses_nothing(small_disk, tmp_path):
     """16 kB a rollout on a disk of 768 kB: it ends with an error that says so, and goes on elsewhere where there is room."""
     out = small_disk / "a.zarr"
-    with pytest.raises(OSError, match="full .*finished are kept") as caught:
+    with pytest.raises(OSError, match=r"full .*finished are kept") as caught:
         evaluated(out, function=heavy, samples=80, chunk=4)
     assert caught.value.errno == errno.ENOSPC
     kept = recorded(out)
@@ -557,7 +557,7 @@ def test_blocks_fit_the_memory(tmp_path, monkeypatch):
     assert tight.batch_size < 30 and tight.program_bytes <= 2**20
     assert_equal(arrays(free.out), arrays(tight.out))
     monkeypatch.setattr("jaxdyn.scale.study.available_memory", lambda _: 2000)
-    with pytest.raises(MemoryError, match="2 rollouts needs .*allowed"):
+    with pytest.raises(MemoryError, match=r"2 rollouts needs .*allowed"):
         run("c.zarr")
     assert not (tmp_path / "c.zarr").exists()
 
@@ -835,7 +835,7 @@ def test_keywords_of_evaluate_and_run(tmp_path):
     np.testing.assert_allclose(run.reductions["mean"]["mean"], np.mean(1 / x), rtol=1e-14)
     assert run.batch_size == 2
     options = {"samples": 6, "seed": 7, "rows": ["z", "parameter_x"], "reductions": {"mean": jd.scale.Mean("z")}}
-    with pytest.warns(DeprecationWarning, match="chunk, progress .*fields"):
+    with pytest.warns(DeprecationWarning, match=r"chunk, progress .*fields"):
         again = jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", chunk=3, progress=False, **options)
     assert again.computed == 0
     with pytest.raises(TypeError, match="no argument lanes"):

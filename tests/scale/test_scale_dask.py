@@ -304,7 +304,7 @@ def test_the_scheduler_killed_and_started_again(whole, tmp_path):
             running.wait_for_chunks(5)
             scheduler.kill()
             scheduler.wait()
-            with pytest.raises(ConnectionError, match="did not come .*is kept"):
+            with pytest.raises(ConnectionError, match=r"did not come .*is kept"):
                 running.end()
         kept = recorded(running.out)
         begin()
@@ -422,7 +422,7 @@ def test_a_cluster_that_does_not_fit_is_refused(client, tmp_path, monkeypatch):
     for other in ("tcp://127.0.0.1:1", object()):
         with pytest.raises(ValueError, match=r"give a dask\.distributed\.Client"):
             evaluate(out, other)
-    with pytest.raises(ValueError, match="devices .* client"):
+    with pytest.raises(ValueError, match=r"devices .* client"):
         evaluate(out, client, devices=jax.local_devices())
     told = client.get_versions
 
