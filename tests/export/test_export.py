@@ -157,24 +157,10 @@ def test_single_precision(tmp_path):
     got = exported(x)
     assert got.dtype == np.float32
     np.testing.assert_allclose(got, np.sin(x.astype(float)) * x[::-1], rtol=1e-6)
+    slopes = np.diag(np.cos(x) * x[::-1]) + np.diag(np.sin(x))[:, ::-1]
+    np.testing.assert_allclose(exported.jacobian(x)[0], slopes, rtol=1e-6)
     assert "const float x[2]" in (exported.save(tmp_path) / "single.h").read_text()
     run_c(tmp_path, "single")
-
-
-def test_forward_dynamics_in_single_precision(arm, exported, tmp_path):
-    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arm)
-    x = [y.astype(np.float32) for y in (X, V, TAU)]
-    small = jd.export(
-        lambda q, v, tau: jd.forward_dynamics(single, q, v, tau), *x, name="small", derivatives="jacobian"
-    )
-    assert small(*x).dtype == np.float32
-    np.testing.assert_allclose(
-        small(*x), exported(X, V, TAU), rtol=1e-3
-    )  # the arm's mass matrix loses four digits of seven
-    for got, expected in zip(small.jacobian(*x), exported.jacobian(X, V, TAU), strict=True):
-        np.testing.assert_allclose(got, expected, atol=1e-3 * np.abs(expected).max())
-    small.save(tmp_path)
-    run_c(tmp_path, "small")
 
 
 @pytest.mark.long
@@ -509,6 +495,8 @@ def test_every_target_compiles(exported, tmp_path, target):
         assert binary[:4] == b"\0asm"
     else:
         assert binary[:4] == b"\x7fELF" and int.from_bytes(binary[18:20], "little") == machines.get(target, 62)
+    if target == "cortex-m7":  # the runtime has no more
+        assert all(name in LIBM or name.startswith("__aeabi") for name in undefined_symbols(tmp_path / "arm_fd.o"))
 
 
 def test_baseline_of_x86_64_runs_here(exported, tmp_path):
@@ -569,12 +557,6 @@ def test_maxima_on_cortex_m(tmp_path):
             np.testing.assert_array_equal(got, expected)
 
 
-def test_cortex_m_calls_only_what_the_runtime_has(exported, tmp_path):
-    exported.save(tmp_path, target="cortex-m7")
-    names = undefined_symbols(tmp_path / "arm_fd.o")
-    assert all(name in LIBM or name.startswith("__aeabi") for name in names), names
-
-
 # --- refusals ---
 
 
@@ -591,13 +573,12 @@ def test_cortex_m_calls_only_what_the_runtime_has(exported, tmp_path):
             lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((7,), float), x),
             (X,),
             {"name": "f"},
-            "function cannot be exported: it has pure_callback",
+            "it has pure_callback",
         ),
-        (lambda x: x[x > 0], (X,), {"name": "f"}, "cannot be exported: it has shapes, branches or conversions"),
-        (lambda x: x if x[0] > 0 else -x, (X,), {"name": "f"}, "cannot be exported: it has shapes, branches"),
-        (lambda x: jnp.asarray(np.sin(x)), (X,), {"name": "f"}, "cannot be exported: it has shapes, branches"),
-        (lambda x: jax.lax.complex(x, x), (X,), {"name": "f"}, "cannot be exported: it has an array of complex128"),
-        (lambda x: jnp.argsort(x), (X,), {"name": "f"}, "cannot be exported: it has sort"),
+        (lambda x: x[x > 0], (X,), {"name": "f"}, "it has shapes, branches"),
+        (lambda x: x if x[0] > 0 else -x, (X,), {"name": "f"}, "it has shapes, branches"),
+        (lambda x: jax.lax.complex(x, x), (X,), {"name": "f"}, "array of complex128"),
+        (lambda x: jnp.argsort(x), (X,), {"name": "f"}, "it has sort"),
     ],
 )
 def test_refusals(function, examples, options, message):
@@ -659,10 +640,7 @@ def test_solutions_of_equations_and_what_to_write_in_place_of_other_factors():
     def decomposed(x):
         return jnp.linalg.svd(jnp.outer(x, x) + jnp.eye(4), compute_uv=False)
 
-    words = (
-        r"it has svd, in .*decomposed \(test_export.py:\d+\); decompose a constant matrix once, outside of the function"
-    )
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=r"svd, in .*decomposed \(test_export.py:\d+\); decompose"):
         jd.export(decomposed, x, name="decomposed")
 
 
