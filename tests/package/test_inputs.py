@@ -204,18 +204,9 @@ OPTIONS = [
     ({"stepsize": "0.1"}, "stepsize is .*; pass an array of numbers"),
     ({"stepsize": -0.1}, "stepsize is -0.1; pass a positive number"),
     ({"stepsize": jd.simulation.Steps(0.1, rtol=1e-6)}, "rtol is given, and RK4 has no use for it with fixed steps"),
-    (
-        {"stepsize": jd.simulation.Steps(0.1, atol=1e-6), "solver": diffrax.Tsit5()},
-        "atol is given, and Tsit5 has no use",
-    ),
-    (
-        {"stepsize": jd.simulation.Steps(diffrax.StepTo(jnp.linspace(0, 1, 5)), rtol=1e-6)},
-        "rtol is given, and Dopri8 .* their own steps",
-    ),
-    (
-        {"events": [jd.events.ModeSwitches(8)]},
-        r"events has ModeSwitches\(max_events=8\), and no force of the scene has events",
-    ),
+    ({"stepsize": jd.simulation.Steps(0.1, atol=1e-6), "solver": diffrax.Tsit5()}, "atol .*Tsit5 has no use"),
+    ({"stepsize": jd.simulation.Steps(diffrax.StepTo(jnp.linspace(0, 1, 5)), rtol=1e-6)}, "rtol .*their own steps"),
+    ({"events": [jd.events.ModeSwitches(8)]}, "ModeSwitches.*no force of"),
     ({"events": jd.events.JointLimit()}, "events is JointLimit.*; pass a list"),
     ({"events": ["stop"]}, "events has 'stop'; give objects of jd.events"),
     ({"events": [jd.events.ContactLost()]}, "ContactLost.*, and the scene has no cones"),

@@ -157,11 +157,7 @@ def test_a_member_is_found_again(tmp_path):
     np.testing.assert_array_equal(table.y[:, 0], table.parameter_x**2)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"chunk": 7}, {"batch_size": 2}, {"devices": 1}, {"chunk": None}],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [{"chunk": 7}, {"batch_size": 2}, {"devices": 1}, {"chunk": None}], ids=str)
 def test_rows_do_not_depend_on_how_they_are_computed(tmp_path, options):
     want = arrays(evaluated(tmp_path / "a.zarr").out)
     if "devices" in options:
@@ -230,12 +226,6 @@ def started(code, *args, **environment):
     return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def ended(process, timeout=400.0):
-    out, error = process.communicate(timeout=timeout)
-    assert process.returncode == 0, error[-3000:]
-    return out
-
-
 def recorded(path):
     """Number of finished chunks."""
     return sum(file.name.isdigit() for file in (Path(path) / "result" / "c").glob("*"))
@@ -287,7 +277,7 @@ def test_the_second_run_on_a_store_is_refused(tmp_path):
     out = tmp_path / "a.zarr"
     evaluated(out)
     with lock_store(out):
-        with pytest.raises(ValueError, match=rf"process {os.getpid()} of .* on .*, since .*, is writing.*wait for it"):
+        with pytest.raises(ValueError, match=f"process {os.getpid()} of .* is writing"):
             evaluated(out)
     assert evaluated(out).computed == 0
 
@@ -547,6 +537,8 @@ def test_quantiles_outside_of_the_bins_are_not_made_up():
 
 
 def test_blocks_fit_the_memory(tmp_path, monkeypatch):
+    assert 2**20 < program.available_memory(jax.local_devices()) < 2**50
+
     def run(name):
         return evaluated(tmp_path / name, function=heavy, samples=400, chunk=400, batch_size=400)
 
@@ -562,10 +554,6 @@ def test_blocks_fit_the_memory(tmp_path, monkeypatch):
     assert not (tmp_path / "c.zarr").exists()
 
 
-def test_free_memory_is_that_of_the_system():
-    assert 2**20 < program.available_memory(jax.local_devices()) < 2**50
-
-
 # Bad input
 
 
@@ -573,10 +561,7 @@ def test_free_memory_is_that_of_the_system():
     ("options", "error"),
     [
         ({"samples": None}, "samples is None; say how many"),
-        (
-            {"parameters": {"x": np.ones(3), "w": np.ones(4)}, "samples": None},
-            r"parameters\['w'\] is of 4 .*'x'\] of 3|of 3",
-        ),
+        ({"parameters": {"x": np.ones(3), "w": np.ones(4)}, "samples": None}, r"parameters\['w'\] is of 4"),
         ({"parameters": {"x": np.ones(3)}, "samples": 5}, "is of 3 rollouts and samples of 5"),
         ({"parameters": {"x": 1.0}, "samples": 5}, "is one number"),
         ({"seed": -1}, "seed is -1"),
@@ -798,23 +783,21 @@ def test_stores_that_cannot_be_are_refused_with_the_cause(tmp_path, monkeypatch)
     text = place.read_text()
     for content in (text[:60], "", "[]", "null", "\x00", text.replace('"rollouts"', '"x"')):
         place.write_text(content)
-        with pytest.raises(
-            ValueError, match=f"out is '{out}', whose zarr.json is damaged .*name another store|format is"
-        ):
+        with pytest.raises(ValueError, match=r"zarr.json is damaged|format is"):
             jd.scale.evaluate(square, parameters, out=out, **QUIET)
     place.write_text(text)
     with monkeypatch.context() as patched:  # root may write anywhere
         patched.setattr(os, "access", lambda *_: False)
-        with pytest.raises(ValueError, match=f"{out} cannot be written; change its permissions"):
+        with pytest.raises(ValueError, match=f"{out} cannot be written"):
             jd.scale.evaluate(square, parameters, out=out, **QUIET)
-        with pytest.raises(ValueError, match=f"{tmp_path} cannot be written; change its permissions"):
+        with pytest.raises(ValueError, match=f"{tmp_path} cannot be written"):
             jd.scale.evaluate(square, parameters, out=tmp_path / "b.zarr", **QUIET)
     assert jd.scale.evaluate(square, parameters, out=out, **QUIET).success
 
 
 @pytest.mark.long
 def test_keywords_of_evaluate_and_run(tmp_path):
-    """Members by their seed, chosen rows, units, reductions against NumPy, one more attempt for what raises, and the meter."""
+    """Members by their seed, chosen rows, units; former keywords."""
     keys = [jax.random.fold_in(jax.random.key(7), i) for i in range(6)]
     x = np.array([drawn(key)["x"] for key in keys])
     run = jd.scale.evaluate(
@@ -825,16 +808,14 @@ def test_keywords_of_evaluate_and_run(tmp_path):
         seed=7,
         rows=["z", "parameter_x"],
         units={"z": "1/m", "x": "m"},
-        reductions={"mean": jd.scale.Mean("z")},
         resources=jd.scale.Resources(batch_size=2, progress=False),
     )
     table = run.dataset()
     np.testing.assert_allclose(table["z"], 1 / x, rtol=1e-14)
     np.testing.assert_allclose(table["parameter_x"], x, rtol=0)
     assert "y" not in table and table["z"].attrs["units"] == "1/m" and table["parameter_x"].attrs["units"] == "m"
-    np.testing.assert_allclose(run.reductions["mean"]["mean"], np.mean(1 / x), rtol=1e-14)
     assert run.batch_size == 2
-    options = {"samples": 6, "seed": 7, "rows": ["z", "parameter_x"], "reductions": {"mean": jd.scale.Mean("z")}}
+    options = {"samples": 6, "seed": 7, "rows": ["z", "parameter_x"]}
     with pytest.warns(DeprecationWarning, match=r"chunk, progress .*fields"):
         again = jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", chunk=3, progress=False, **options)
     assert again.computed == 0
@@ -843,39 +824,17 @@ def test_keywords_of_evaluate_and_run(tmp_path):
 
 
 @pytest.mark.long
-def test_seed_rows_retries_and_progress_of_runs(tmp_path, capsys, monkeypatch):
-    """Starts drawn by a seed move freely in a straight line; a chunk that raises once is computed at the second attempt."""
+def test_seed_rows_and_progress_of_runs(tmp_path, capsys):
+    """Starts drawn by a seed move freely in a straight line."""
     model = jd.ModelBuilder("free", gravity=None)
     model.add_body("a", None, "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(1, 0, 0))
-
-    def simulated(name, retries=2, progress=False):
-        return jd.scale.run(
-            model.build(), lambda p: (jnp.zeros(1), p["v"][None]), lambda key: {"v": jax.random.normal(key, ())},
-            np.array([0.0, 2.0]), samples=4, out=tmp_path / name, seed=3, rows=["q"],
-            resources=jd.scale.Resources(retries=retries, progress=progress),
-        )  # fmt: skip
-
-    run = simulated("a.zarr", progress=True)
+    run = jd.scale.run(
+        model.build(), lambda p: (jnp.zeros(1), p["v"][None]), lambda key: {"v": jax.random.normal(key, ())},
+        np.array([0.0, 2.0]), samples=4, out=tmp_path / "a.zarr", seed=3, rows=["q"],
+        resources=jd.scale.Resources(progress=True),
+    )  # fmt: skip
     assert "4" in capsys.readouterr().err
     v = np.array([jax.random.normal(jax.random.fold_in(jax.random.key(3), i), ()) for i in range(4)])
     table = run.dataset()
     np.testing.assert_allclose(np.asarray(table["q"]).reshape(4, 2)[:, -1], 2 * v, atol=1e-10)
     assert "v" not in table
-    calls, whole = [], program.Program.start
-
-    def breaks_once(self, numbers):
-        calls.append(numbers)
-        if len(calls) == 2:  # the first measures the time of a batch
-            raise OSError("the device was lost")
-        return whole(self, numbers)
-
-    for name, retries in (("b.zarr", 1), ("c.zarr", 0)):
-        calls.clear()
-        monkeypatch.setattr(program.Program, "start", breaks_once)
-        if retries:
-            again = simulated(name, retries)
-            np.testing.assert_array_equal(again.dataset()["result"], table["result"])
-        else:
-            with pytest.raises(RuntimeError, match="the device was lost"):
-                simulated(name, retries)
-    assert capsys.readouterr().err == ""

@@ -182,38 +182,6 @@ def test_a_worker_killed_in_a_chunk(client, whole, tmp_path):
     assert_same(running.end(), whole(SLOW // 3))
 
 
-@pytest.mark.slow
-def test_all_workers_killed(client, whole, tmp_path):
-    """The nannies start others, which get the study, and the tasks that waited."""
-    running = Running(tmp_path / "a.zarr", client, iterations=SLOW)
-    running.wait_for_chunks(5)
-    kept = {name: (running.out / name).stat().st_mtime_ns for name in files(running.out) if name.startswith("result")}
-    before = pids(client)
-    for pid in before:
-        os.kill(pid, signal.SIGKILL)
-    assert_same(running.end(), whole(SLOW))
-    assert not set(before) & set(pids(client))
-    assert all((running.out / name).stat().st_mtime_ns == time for name, time in kept.items())  # not written again
-
-
-@pytest.mark.slow
-def test_a_worker_leaves_and_another_joins(whole, tmp_path):
-    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
-    with distributed.LocalCluster(n_workers=2, **options) as local, distributed.Client(local) as client:
-        client.wait_for_workers(2)
-        running = Running(tmp_path / "a.zarr", client, iterations=SLOW)
-        running.wait_for_chunks(5)
-        first, second = client.nthreads()
-        client.retire_workers([first], close_workers=True)
-        running.wait_for_chunks(10)
-        local.scale(3)
-        client.wait_for_workers(2)
-        joined = set(client.nthreads()) - {first, second}
-        wait_for(lambda: recorded(running.out) == 60 or any(client.processing()[x] for x in joined), "a task there")
-        assert_same(running.end(), whole(SLOW))
-        assert joined
-
-
 SCRIPT = """
 import sys
 import jax
@@ -436,14 +404,13 @@ def test_a_cluster_that_does_not_fit_is_refused(client, tmp_path, monkeypatch):
         return get
 
     for changes, said in (
-        ({"jaxdyn": None}, "has jaxdyn not at all, and this process"),
-        ({"jaxdyn": "0.0.1"}, r"has jaxdyn 0\.0\.1, and this process"),
-        ({"distributed": "2020.1.0"}, r"has distributed 2020\.1\.0, and this process"),
-        ({"python": "3.9.1.final.0"}, r"has python 3\.9\.1"),
+        ({"jaxdyn": None}, "jaxdyn not at all"),
+        ({"jaxdyn": "0.0.1"}, r"jaxdyn 0\.0\.1"),
+        ({"python": "3.9.1.final.0"}, r"python 3\.9\.1"),
     ):
         with monkeypatch.context() as patched:
             patched.setattr(client, "get_versions", versions(**changes))
-            with pytest.raises(ValueError, match=rf"client: worker tcp://.* {said}.*install the same version on both"):
+            with pytest.raises(ValueError, match=rf"worker tcp://.* has {said}.*same version"):
                 evaluate(out, client)
     assert not out.exists()
 
