@@ -345,7 +345,7 @@ def test_points_and_frames_are_named_and_leave_paths(turning):
         jd.draw(scene, first.q[0], points={"P": (0.3, 0.1, 0.0)})
 
 
-@pytest.mark.parametrize("name", ("four_bar", "rolling_coin", "bicycle"))
+@pytest.mark.parametrize("name", ("four_bar", "bicycle"))
 def test_labels_are_within_the_figure_and_the_box_fills_it(name):
     axes = jd.draw(getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()[0])
     figure = axes.figure
