@@ -55,6 +55,15 @@ def run_c(folder, name: str, compile_command: list[str] | None = None, runner: t
     return ran.stdout
 
 
+def status_of(exported, *arrays, batch: bool = True) -> int:
+    """Call the function in C, or that of batches, with arguments and arrays for its results; the status."""
+    code = code_of(exported.module("c", standalone.resolve_target("host").lanes))
+    sizes = [ctypes.c_int64] if batch else []
+    kind = ctypes.CFUNCTYPE(ctypes.c_int, *sizes, *[ctypes.c_void_p] * len(arrays))
+    function = kind(code.address(f"{exported.name}_batch" if batch else exported.name))
+    return function(*([len(arrays[0])] if batch else []), *(x.ctypes.data for x in arrays))
+
+
 def test_calls_from_numpy_equal_the_library(arm, exported):
     np.testing.assert_allclose(exported(X, V, TAU), jd.forward_dynamics(arm, *STATE), rtol=1e-12)
     # The independent answer: inverse dynamics by another recursion gives the torques back.
@@ -129,14 +138,11 @@ def test_header_names_joints_units_sizes_and_stack(exported, tmp_path):
 
 
 def test_batch_over_vector_lanes_equals_single_samples(exported):
-    lanes = standalone.resolve_target("host").lanes
-    code = code_of(exported.module("c", lanes))
     for n in (0, 1, 3, 13):
         rng = np.random.default_rng(n)
         q, v, tau = (np.ascontiguousarray(rng.normal(size=(n, 7))) for _ in range(3))
         out = np.full((n, 7), np.nan)
-        function = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, *[ctypes.c_void_p] * 4)(code.address("arm_fd_batch"))
-        assert function(n, *(x.ctypes.data for x in (q, v, tau, out))) == 0
+        assert status_of(exported, q, v, tau, out) == 0
         expected = np.array([exported(*row) for row in zip(q, v, tau, strict=True)]).reshape(n, 7)
         np.testing.assert_allclose(out, expected, rtol=1e-11, atol=1e-11)
 
@@ -209,11 +215,8 @@ def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
     np.testing.assert_allclose(exported.jacobian(q * 0, q * 0, q)[2], np.linalg.inv(M), rtol=1e-10)
 
     rows = np.stack([q, q * 0, q, -q, q * 0]), np.zeros((5, 2)), np.tile(q, (5, 1))
-    lanes = standalone.resolve_target("host").lanes
-    code = code_of(exported.module("c", lanes))
-    batch = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, *[ctypes.c_void_p] * 4)(code.address("crossing_batch"))
     out = np.full((5, 2), np.nan)
-    assert batch(5, *(x.ctypes.data for x in (*rows, out))) == 0
+    assert status_of(exported, *rows, out) == 0
     np.testing.assert_allclose(out, [exported(*row) for row in zip(*rows, strict=True)], rtol=1e-11)
 
 
@@ -233,19 +236,11 @@ def test_rows_that_contradict_each_other_give_a_status(tmp_path):
 def test_results_that_are_not_finite_have_a_status(tmp_path):
     exported = jd.export(lambda x: (jnp.log(x), 1 / x), np.zeros(2), name="f", batch=True)
     assert np.isinf(exported(np.zeros(2))[0]).all()
-    lanes = standalone.resolve_target("host").lanes
-    code = code_of(exported.module("c", lanes))
-    one, many = (
-        ctypes.CFUNCTYPE(ctypes.c_int, *kinds)(code.address(name))
-        for name, kinds in (("f", [ctypes.c_void_p] * 3), ("f_batch", [ctypes.c_int64, *[ctypes.c_void_p] * 3]))
-    )
     x, out = np.ones((5, 2)), np.zeros((2, 5, 2))
-    assert one(x.ctypes.data, *(y.ctypes.data for y in out)) == 0
-    assert many(5, x.ctypes.data, *(y.ctypes.data for y in out)) == 0
+    assert status_of(exported, x, *out) == status_of(exported, x, *out, batch=False) == 0
     for bad in (0.0, -1.0, np.nan, np.inf):
         x[3, 1] = bad
-        assert one(x[3].ctypes.data, *(y.ctypes.data for y in out)) == 2
-        assert many(5, x.ctypes.data, *(y.ctypes.data for y in out)) == 2
+        assert status_of(exported, x, *out) == status_of(exported, x[3], *out, batch=False) == 2
     exported.save(tmp_path)
     run_c(tmp_path, "f")  # which expects the status at its examples
 
@@ -281,12 +276,9 @@ def test_redundant_rows(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "constrained", [pytest.param(False, marks=pytest.mark.slow), True], ids=["free", "constrained"]
-)
-def test_a_step_of_an_integrator(constrained, tmp_path):
-    scene = jd.scenes.four_bar() if constrained else jd.Scene(jd.robots.ur5())
-    q, v = map(np.asarray, jd.scenes.four_bar.start()) if constrained else (X[:6], V[:6])
+def test_a_step_of_an_integrator(tmp_path):
+    scene = jd.scenes.four_bar()
+    q, v = map(np.asarray, jd.scenes.four_bar.start())
     tau = np.linspace(0.5, 1, scene.nv)
     step = jd.stepper(scene, 0.002, substeps=2)
     exported = jd.export(lambda q, v, tau: step((q, v), tau), q, v, tau, name="step")

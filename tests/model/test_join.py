@@ -1,6 +1,5 @@
 """Models joined into one, against the separate models; and the plate that several arms lift together."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -142,17 +141,3 @@ def test_arms_lift_a_plate_together(count):
     force = 4 * (a[-6:-3] + np.cross(omega, linear) + np.array([0.0, 0.0, 9.81]))
     torque = moments @ a[-3:] + np.cross(omega, moments @ omega)
     assert_close(G @ lam, np.concatenate([force, torque]), 1e-9)
-
-
-@pytest.mark.slow
-def test_lifting_in_motion():
-    """A tenth of a second: closed to 1e-12, energy constant without torques, the same by both methods."""
-    scene, (q, v) = scenes.coordinated_lifting(), scenes.coordinated_lifting.start()
-    ts, ends = jnp.array([0.0, 0.05, 0.1]), []
-    for method in ("projected", "reduced"):
-        options = {"stepsize": 0.01, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
-        solution = quick(lambda q, v, method=method: jd.simulate(scene, q, v, ts, method=method, **options))(q, v)  # noqa: B023
-        assert bool(solution.success) and float(solution.constraint_residual.max()) < 1e-12
-        np.testing.assert_allclose(solution.energy, solution.energy[0], rtol=1e-9)
-        ends.append(solution.q)
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)

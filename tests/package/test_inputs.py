@@ -173,24 +173,6 @@ def test_functions_of_a_scene_take_a_system_as_one(name, call):
             call[0](ARM, *call[1:])
 
 
-def test_a_scene_is_no_system_of_another():
-    with pytest.raises(ValueError, match=r"pass scene\.system"):
-        jd.Scene(CHAIN)
-    with pytest.raises(ValueError, match="system is a str"):
-        jd.Scene("arm")
-
-
-def test_a_batch_without_vmap_is_told_so():
-    with pytest.raises(ValueError, match=r"shape \(4, 2\).*jax\.vmap"):
-        jd.simulate(ARM, [0, 0], [0, 0], [0, 1], control=lambda q, v, t: jnp.ones((4, 2)))
-    with pytest.raises(ValueError, match=r"nu .*jax\.vmap"):
-        jd.reduced_dynamics(CHAIN, Q, jnp.ones((4, 1)), basis=(0,))
-    with pytest.raises(ValueError, match=r"multipliers .*jax\.vmap"):
-        jd.constraint_forces(CHAIN, Q, jnp.ones((4, 1)))
-    with pytest.raises(ValueError, match=r"stepsize .*jax\.vmap"):
-        jd.simulate(ARM, [0, 0], [0, 0], [0, 1], stepsize=[0.1, 0.2])
-
-
 def stiffer(q, v, t):
     return -q if t < 0.5 else q
 
@@ -212,6 +194,8 @@ OPTIONS = [
     ({"events": [jd.events.ContactLost()]}, "ContactLost.*, and the scene has no cones"),
     ({"control": lambda q, v, t: np.sin(q)}, "control needs the values .* jax.numpy"),
     ({"control": stiffer}, r"control needs the values .* jax\.lax\.cond instead of if"),
+    ({"control": lambda q, v, t: jnp.ones((4, 2))}, r"shape \(4, 2\).*jax\.vmap"),
+    ({"stepsize": [0.1, 0.2]}, r"stepsize .*jax\.vmap"),
     ({"control": lambda q, v: q}, r"control takes \(q, v\), but is called as control\(q, v, t\)"),
 ]
 
@@ -238,11 +222,6 @@ def test_a_model_without_moving_bodies():
     assert acceleration.shape == (0,) and np.isnan(centre).all() and not momentum.any()
     with pytest.raises(ValueError, match="so nothing moves"):
         jd.simulate(empty, none, none, [0.0, 1.0])
-
-
-def test_forces_that_do_not_fit_are_named():
-    with pytest.raises(ValueError, match=r"forces\[0\] takes .*\(system,"):
-        jd.simulate(jd.Scene(ARM, forces=(stiffer,)), [0, 0], [0, 0], [0, 1], stepsize=0.1)
 
 
 def test_paths(tmp_path, monkeypatch):
@@ -420,6 +399,16 @@ def test_codes_of_a_batch_print_as_words():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: jd.Scene(CHAIN), r"pass scene\.system"),
+        (lambda: jd.Scene("arm"), "system is a str"),
+        # Batches without vmap.
+        (lambda: jd.reduced_dynamics(CHAIN, Q, jnp.ones((4, 1)), basis=(0,)), r"nu .*jax\.vmap"),
+        (lambda: jd.constraint_forces(CHAIN, Q, jnp.ones((4, 1))), r"multipliers .*jax\.vmap"),
+        # Functions of other arguments.
+        (
+            lambda: jd.simulate(jd.Scene(ARM, forces=(stiffer,)), [0, 0], [0, 0], [0, 1], stepsize=0.1),
+            r"forces\[0\] takes",
+        ),
         (lambda: jd.Holonomic(lambda q: q), r"phi takes \(q\), but is called as \(q, t\)"),
         (lambda: jd.Holonomic(lambda q, t: q, with_system=True), r"called as \(system, q, t\)"),
         (lambda: jd.Pfaffian(lambda q: q), r"A takes \(q\), but is called as \(q, t\)"),
@@ -434,7 +423,7 @@ def test_codes_of_a_batch_print_as_words():
         (lambda: hybrid(lambda q: q, force=lambda: 0), r"force takes \(\), but is called as \(t\)"),
     ],
 )
-def test_functions_of_other_arguments_are_refused_when_they_are_given(make, words):
+def test_what_does_not_fit_is_refused_when_it_is_given(make, words):
     with pytest.raises(ValueError, match=words):
         make()
 

@@ -199,23 +199,29 @@ def test_a_program_has_no_communication(pendulums):
 
 # Interruptions
 
+# Also on the workers of a scheduler, whose address is the second argument.
 SLOW = """
-import sys, time
+import sys
 import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
-import jax.numpy as jnp
 import jaxdyn as jd
 
-def drawn(key):
+def draw(key):
     return jax.random.uniform(key, (), minval=0.1, maxval=0.9)
 
 def logistic(x):
     return {"x": jax.lax.fori_loop(0, 300_000, lambda _, x: 3.9 * x * (1 - x), x)}
 
-found = jd.scale.evaluate(logistic, drawn, samples=160, out=sys.argv[1], reductions={"x": jd.scale.Mean("x")},
-                          resources=jd.scale.Resources(batch_size=4, chunk=4, progress=False))
-print(found.computed)
+if __name__ == "__main__":
+    client = None
+    if len(sys.argv) > 2:
+        from distributed import Client
+        client = Client(sys.argv[2])
+    reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
+    resources = jd.scale.Resources(client, batch_size=4, chunk=4, progress=False)
+    run = jd.scale.evaluate(logistic, draw, samples=240, out=sys.argv[1], reductions=reductions, resources=resources)
+    print(run.computed)
 """
 
 
@@ -250,11 +256,11 @@ def test_kill_9_and_resume(tmp_path):
     process = started(SLOW, out)
     killed_at([process], out, 3, [0])
     kept = recorded(out)
-    assert 3 <= kept < 40
+    assert 3 <= kept < 60
     assert f"process {process.pid} of" in (tmp_path / "killed.zarr.owner").read_text()
     before = {name: data for name, data in files(out).items() if name.startswith("result")}
     resumed = slow_here(out)  # the lock of a dead process is free
-    assert resumed.computed == 160 - 4 * kept
+    assert resumed.computed == 240 - 4 * kept
     assert before.items() <= files(out).items()
     whole = slow_here(tmp_path / "whole.zarr")
     assert files(out) == files(whole.out)
@@ -264,10 +270,11 @@ def test_kill_9_and_resume(tmp_path):
 
 def slow_here(out):
     """What `SLOW` computes, in this process."""
-    source: dict = {}
-    exec(SLOW.split("found =")[0].replace("jax.config.update(", "(lambda *_: None)("), source)
-    options = {"samples": 160, "batch_size": 4, "chunk": 4, "reductions": {"x": jd.scale.Mean("x")}}
-    return evaluated(out, function=source["logistic"], parameters=source["drawn"], **options)
+    source: dict = {"__name__": "slow"}
+    exec(SLOW.replace("jax.config.update(", "(lambda *_: None)("), source)
+    reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
+    options = {"samples": 240, "batch_size": 4, "chunk": 4, "reductions": reductions}
+    return evaluated(out, function=source["logistic"], parameters=source["draw"], **options)
 
 
 # Stores that are not what they should be
@@ -349,34 +356,8 @@ def test_a_store_of_another_scene_or_other_times_is_refused(pendulums, tmp_path)
             jd.scale.run(scene, (starts, np.zeros(2)), {"damping": damping}, times, **options)
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=768k", "tmpfs", folder], capture_output=True)
-    if mounted.returncode:
-        pytest.skip("no file system can be mounted here")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
 def heavy(p):
     return {"y": jnp.full(2000, p["x"])}
-
-
-def test_a_full_disk_loses_nothing(small_disk, tmp_path):
-    """16 kB a rollout on a disk of 768 kB: it ends with an error that says so, and goes on elsewhere where there is room."""
-    out = small_disk / "a.zarr"
-    with pytest.raises(OSError, match=r"full .*finished are kept") as caught:
-        evaluated(out, function=heavy, samples=80, chunk=4)
-    assert caught.value.errno == errno.ENOSPC
-    kept = recorded(out)
-    assert kept > 3 and not list(small_disk.rglob("*.partial"))
-    shutil.copytree(out, tmp_path / "roomy.zarr")
-    resumed = evaluated(tmp_path / "roomy.zarr", function=heavy, samples=80, chunk=4)
-    assert resumed.computed == 80 - 4 * kept and resumed.repaired == ()
-    whole = evaluated(tmp_path / "whole.zarr", function=heavy, samples=80, chunk=4)
-    assert files(resumed.out) == files(whole.out)
 
 
 def test_a_full_disk_is_told_wherever_it_is_met(tmp_path, monkeypatch):

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import test_scale
 from test_scale import files, recorded
 
 import jaxdyn as jd
@@ -182,27 +183,6 @@ def test_a_worker_killed_in_a_chunk(client, whole, tmp_path):
     assert_same(running.end(), whole(SLOW // 3))
 
 
-SCRIPT = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-import jaxdyn as jd
-from distributed import Client
-
-def draw(key):
-    return jax.random.uniform(key, (), minval=0.1, maxval=0.9)
-
-def logistic(x):
-    return {"x": jax.lax.fori_loop(0, 300_000, lambda _, x: 3.9 * x * (1 - x), x)}
-
-if __name__ == "__main__":
-    reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
-    with Client(sys.argv[1]) as client:
-        print(jd.scale.evaluate(logistic, draw, samples=240, out=sys.argv[2], reductions=reductions,
-                                resources=jd.scale.Resources(client, batch_size=4, chunk=4, progress=False)).computed)
-"""
-
-
 def start(*command, stdout=subprocess.DEVNULL):
     env = os.environ | {"PYTHONPATH": str(Path(jd.__file__).parents[1]), "JAX_PLATFORMS": "cpu"}
     return subprocess.Popen([sys.executable, *map(str, command)], env=env, stdout=stdout, stderr=subprocess.DEVNULL)
@@ -210,17 +190,15 @@ def start(*command, stdout=subprocess.DEVNULL):
 
 @pytest.mark.slow
 def test_the_client_killed_and_started_again(client, whole, tmp_path):
-    script, out = tmp_path / "script.py", tmp_path / "a.zarr"
-    script.write_text(SCRIPT)
-    address = client.scheduler.address
-    first = start(script, address, out)
+    out, address = tmp_path / "a.zarr", client.scheduler.address
+    first = start("-c", test_scale.SLOW, out, address)
     wait_for(lambda: recorded(out) >= 5, "chunks")
     with pytest.raises(ValueError, match=f"process {first.pid} of .* is writing"):
         evaluate(out, client, iterations=SLOW)
     first.kill()
     first.communicate()
     kept = recorded(out)
-    second = start(script, address, out, stdout=subprocess.PIPE)
+    second = start("-c", test_scale.SLOW, out, address, stdout=subprocess.PIPE)
     computed = int(second.communicate(timeout=LONG)[0])
     # Workers finish the tasks that they have, sixteen at most, until the scheduler misses the client.
     assert 240 - 4 * (kept + 16) <= computed <= 240 - 4 * kept
@@ -284,41 +262,18 @@ def test_the_scheduler_killed_and_started_again(whole, tmp_path):
 
 # From the shell
 
-STUDY = """
-scene = "functions.py"
-out = "here.zarr"
-samples = 12
-duration = 0.1
-points = 3
-[parameters]
-damping = { log_uniform = [0.1, 1.0] }
-[options]
-stepsize = 0.01
-batch_size = 4  # one rollout alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least
-[reductions]
-q = { mean = "q" }
-"""
-FUNCTIONS = """
-import jax.numpy as jnp
-import jaxdyn as jd
-
-def scene(p):
-    system = jd.scenes.double_pendulum().system
-    return jd.Scene(system, forces=(jd.forces.JointDamping(p["damping"] * jnp.ones(2)),))
-
-def states(p):
-    return 0.5 * jnp.ones(2), jnp.zeros(2)
-"""
+# One rollout alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least.
+STUDY = test_scale.STUDY.replace("[options]", "[options]\nbatch_size = 4")
 
 
 @pytest.mark.slow
 def test_sweep_on_clusters(cluster, tmp_path):
     file = tmp_path / "study.toml"
     file.write_text(STUDY)
-    (tmp_path / "functions.py").write_text(FUNCTIONS)
+    (tmp_path / "study.py").write_text(test_scale.FUNCTIONS)
     sweep = ("-m", "jaxdyn", "sweep", file, "--quiet", "--chunk", 3)
     places = {
-        "here": [],
+        "here": ["--out", tmp_path / "here.zarr"],
         "workers": ["--workers", 2, "--out", tmp_path / "workers.zarr"],
         "client": ["--client", cluster.scheduler_address, "--out", tmp_path / "client.zarr"],
     }
@@ -337,7 +292,7 @@ def test_sweep_refuses_places_without_a_scheduler(tmp_path, capsys):
 
     file = tmp_path / "study.toml"
     file.write_text(STUDY)
-    (tmp_path / "functions.py").write_text(FUNCTIONS)
+    (tmp_path / "study.py").write_text(test_scale.FUNCTIONS)
     with dask.config.set({"distributed.comm.timeouts.connect": "300ms"}):
         assert main(["sweep", str(file), "--client", "tcp://127.0.0.1:1"]) == 2
     assert "--client is tcp://127.0.0.1:1, where no scheduler of Dask answers" in capsys.readouterr().err
@@ -549,18 +504,6 @@ def robot_and_log():
     q, v, a = np.sin(rates * t[:, None]), rates * np.cos(rates * t[:, None]), -(rates**2) * np.sin(rates * t[:, None])
     tau = jax.vmap(lambda *x: jd.inverse_dynamics(model, *x))(q, v, a) + 0.3 * v + 0.5 * np.tanh(v / 0.01)
     return model, jd.identify.Log(t, q, v, a, np.asarray(tau) + 0.02 * noise)
-
-
-@pytest.mark.long
-def test_cross_validation_of_a_fit(client):
-    """The fits of all folds on workers: the trials of this process, in their order and to the last bit."""
-    model, log = robot_and_log()
-    options = {"terms": ("viscous", "coulomb"), "robust": "auto", "weights": None, "inertia": "mass"}
-    here, there = (jd.identify.fit_robot(model, log, client=one, **options) for one in (None, client))
-    assert here.choice.setting == there.choice.setting and len(here.choice.trials) > 8
-    for one, other in zip(here.choice.trials, there.choice.trials, strict=True):
-        assert one.setting == other.setting
-        np.testing.assert_array_equal(one.squares, other.squares)
 
 
 @pytest.mark.long
