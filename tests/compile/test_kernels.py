@@ -451,17 +451,6 @@ def test_functions_with_rules_of_their_own_keep_them():
     np.testing.assert_allclose(run(x), 7 * np.ones(3))
 
 
-def test_the_rule_that_is_given_is_taken():
-    def rule(_, x, steps):
-        return None if steps[0] is None else 9.0 * steps[0]
-
-    def f(x):
-        return backend.kernel(lambda _, x: x * x, derivative=rule)((), x)
-
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(f))(normal(2)), 9 * np.eye(2))
-    np.testing.assert_allclose(jax.jit(jax.jacrev(f))(normal(2)), 9 * np.eye(2))
-
-
 def test_only_what_moves_is_differentiated():
     made = numbers_of(lambda x, y: jnp.sin(x) * jnp.cos(y), jnp.ones(()), jnp.ones(()))
     assert derive.tangent(made, (True, False)).cost < derive.tangent(made, (True, True)).cost

@@ -56,18 +56,6 @@ ENTRY %main (q: f32[4]) -> f32[4] {
     assert gpu.launches(text) == {"once": 1, "each turn": 3, "libraries": 1, "callbacks": 1}
 
 
-@pytest.mark.long
-def test_the_benchmark_for_gpus_runs_to_its_end_without_one(capsys):
-    gpu.measure(["iiwa"], [4], steps=2, size=2**10)
-    printed = capsys.readouterr().out
-    assert "no GPU here" in printed
-    assert [line.split("|")[2].strip() for line in printed.splitlines()[-5:]] == [
-        "forward dynamics", "inverse dynamics", "gradient of forward dynamics", "RK4 rollout, 2 steps",
-        "gradient of the rollout",
-    ]  # fmt: skip
-    assert all(rate > 0 for rate in gpu.peaks(2**10))
-
-
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_sines_of_polynomials(dtype):
     """To a unit and a half in the last place of one, within ten turns and at numbers that are none."""
