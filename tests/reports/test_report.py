@@ -481,7 +481,7 @@ def test_a_scene_of_ones_own(rungs, monkeypatch):
 
 def test_a_page_without_matplotlib_is_refused_before_the_runs(small, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match=r"jaxdyn\\[plot\\]"):
+    with pytest.raises(ImportError, match=r"jaxdyn\[plot\]"):
         jd.report("free_body", rounds=1, out=tmp_path)
     assert small == []
 
