@@ -204,6 +204,9 @@ OPERATIONS = {
     "logic": lambda x: ((x > 0) & (x < 1), (x > 0) | (x < -1), ~(x > 0)),
     "compared flags": lambda x: ((x > 0) == (x < 1), (x > 0) < (x < 1), (x > 0) >= (x < 1)),
     "flags": lambda x: (jnp.maximum(x > 0, x > 1), jnp.minimum(x > 0, x > 1), (x > 0).max(), (x > 0).sum()),
+    "known numbers": lambda x: (
+        jnp.maximum(k := jnp.arange(3.0), 1.0), jnp.stack([k, x[0, :3]]).max(1), jnp.clip(k, 0.5, 1.5), jnp.arctan2(k, 2.0)
+    ),
     "select": lambda x: (jnp.where(x > 0, x, -x), jnp.where(MASK, x, 1.0), jnp.where(x > 0, 2.0, 3.0)),
     "several": lambda x: lax.select_n(jnp.asarray(PLACES), x[0, :3], x[1, :3], x[2, :3]),
     "clamp": lambda x: (jnp.clip(x, -0.3, 0.4), lax.clamp(x[0, 0], x, x[0, 1])),

@@ -360,15 +360,22 @@ def heavy(p):
     return {"y": jnp.full(2000, p["x"])}
 
 
-def test_a_full_disk_is_told_wherever_it_is_met(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
+def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
+    """The run ends with an error that says so, and goes on where there is room again."""
+    out, write = tmp_path / "a.zarr", stores.Store.write
+
+    def full(store, chunk, arrays):
+        if chunk > 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(store, chunk, arrays)
 
     monkeypatch.setattr(stores.Store, "write", full)
-    with pytest.raises(OSError, match="file system is full"):
-        evaluated(tmp_path / "a.zarr")
+    with pytest.raises(OSError, match=r"full .*finished are kept") as caught:
+        evaluated(out)
+    assert caught.value.errno == errno.ENOSPC and recorded(out) == 3
     monkeypatch.undo()
-    assert evaluated(tmp_path / "a.zarr").computed == 23
+    assert evaluated(out).computed == 23 - 3 * 5
+    assert files(out) == files(evaluated(tmp_path / "whole.zarr").out)
 
 
 # Failures and reductions
