@@ -671,21 +671,19 @@ def test_info_expands_xacro(folder, run):
 @pytest.mark.long
 def test_calibrate(folder, run):
     """Poses are chosen, measured on an arm with other lengths, and give these back; held-out poses show the noise."""
-    arm = """<robot name="arm"><link name="base"/>{links}</robot>"""
-    link = """<link name="l{i}"><inertial><mass value="1"/>
-      <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-      <joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="l{i}"/>
-      <origin xyz="{x} 0.1 0.3" rpy="0.3 0 0"/>
-      <axis xyz="{axis}"/><limit lower="-2" upper="2" effort="9" velocity="9"/></joint>"""
 
     def write(name, stretch):
-        links = [
-            link.format(
-                i=i, parent=f"l{i - 1}" if i else "base", x=0.1 + stretch * i, axis=("0 0 1", "0 1 0", "1 0 0")[i]
-            )
-            for i in range(3)
-        ]
-        (folder / name).write_text(arm.format(links="".join(links)))
+        builder = jd.ModelBuilder("arm").add_body("base", joint="fixed")
+        limits = {"lower": -2.0, "upper": 2.0, "effort_limit": 9.0, "velocity_limit": 9.0}
+        for i, axis in enumerate(((0, 0, 1), (0, 1, 0), (1, 0, 0))):
+            options = {
+                "axis": axis,
+                "pose": ((0.1 + stretch * i, 0.1, 0.3), (0.3, 0, 0)),
+                "joint_name": f"j{i}",
+            } | limits
+            parent, ball = f"l{i - 1}" if i else "base", jd.inertia.sphere(1.0, 0.5)
+            builder.add_body(f"l{i}", parent, inertia=ball, **options)
+        jd.save_urdf(builder.build(), folder / name)
 
     write("nominal.urdf", 0.0)
     write("true.urdf", 0.004)

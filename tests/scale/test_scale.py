@@ -783,32 +783,16 @@ def test_stores_that_cannot_be_are_refused_with_the_cause(tmp_path, monkeypatch)
     assert jd.scale.evaluate(square, parameters, out=out, **QUIET).success
 
 
-@pytest.mark.long
-def test_keywords_of_evaluate_and_run(tmp_path):
-    """Members by their seed, chosen rows, units; former keywords."""
-    keys = [jax.random.fold_in(jax.random.key(7), i) for i in range(6)]
-    x = np.array([drawn(key)["x"] for key in keys])
-    run = jd.scale.evaluate(
-        square,
-        drawn,
-        samples=6,
-        out=tmp_path / "a.zarr",
-        seed=7,
-        rows=["z", "parameter_x"],
-        units={"z": "1/m", "x": "m"},
-        resources=jd.scale.Resources(batch_size=2, progress=False),
-    )
+def test_former_keywords_of_evaluate(tmp_path):
+    run = evaluated(tmp_path / "a.zarr", rows=["z"], units={"z": "1/m"})
     table = run.dataset()
-    np.testing.assert_allclose(table["z"], 1 / x, rtol=1e-14)
-    np.testing.assert_allclose(table["parameter_x"], x, rtol=0)
-    assert "y" not in table and table["z"].attrs["units"] == "1/m" and table["parameter_x"].attrs["units"] == "m"
-    assert run.batch_size == 2
-    options = {"samples": 6, "seed": 7, "rows": ["z", "parameter_x"]}
+    assert "y" not in table and table["z"].attrs["units"] == "1/m"
+    options = {"samples": 23, "out": run.out, "rows": ["z"], "units": {"z": "1/m"}}
     with pytest.warns(DeprecationWarning, match=r"chunk, progress .*fields"):
-        again = jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", chunk=3, progress=False, **options)
+        again = jd.scale.evaluate(square, drawn, chunk=5, progress=False, **options)
     assert again.computed == 0
     with pytest.raises(TypeError, match="no argument lanes"):
-        jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", lanes=3, **options)
+        jd.scale.evaluate(square, drawn, lanes=3, **options)
 
 
 @pytest.mark.long
