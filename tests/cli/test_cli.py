@@ -116,6 +116,7 @@ def test_info_locks_floats_and_repairs(arm, run):
 def test_info_of_a_real_robot_says_what_is_not_used(panda, run):
     text = run("info", panda)
     assert "panda_hand_tcp" in text and "<mimic>" in text
+    assert "Degrees of freedom after constraints: 8 of 9" in text and "gear" in text
 
 
 @pytest.mark.long
@@ -337,7 +338,9 @@ def test_identify_finds_delays(truth, folder, run):
     simulate_logs(held, "C", noise=0.005, delay=0.02)
     command = "identify --urdf true.urdf --log A.csv --test-log B.csv --report fit.json --html fit.html"
     command += " --terms viscous coulomb --v-s 0.1 --prior 1 --robust none --payload-log C.csv"
-    assert "Delays of the torques against the positions (ms)" in run(f"{command} --delay auto")
+    text = run(f"{command} --delay auto")
+    assert "Delays of the torques against the positions (ms)" in text and f"Payload on {truth.body_names[-1]}" in text
+    assert "the bodies are" in run(f"{command} --payload-body foot", status=2)
     report = report_of("fit.json")
     delays = report["delays"]
     off, half = np.abs(np.array(delays["seconds"]) - 0.02), delays["interval_factor"] * np.array(delays["std"])
@@ -373,18 +376,6 @@ def held_payload(truth):
     """The arm with a ball of 0.7 kg in its hand."""
     ball = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
     return truth.replace(inertias=truth.inertias.at[-1].add(ball))
-
-
-def test_identify_a_payload(truth, run):
-    simulate_logs(truth, "AB", noise=0.01)
-    simulate_logs(held_payload(truth), "C", noise=0.01)
-    command = f"identify --urdf true.urdf --report fit.json --terms viscous coulomb {GIVEN}"
-    command += " --log A.csv B.csv --payload-log C.csv"
-    assert f"Payload on {truth.body_names[-1]}" in run(command)
-    computed = report_of("fit.json")["payload"]
-    # A slider carries it: the mass is told.
-    assert abs(computed["mass"] - 0.7) < 0.01 and computed["percent"] < 0.2 * computed["percent_without"]
-    assert "the bodies are" in run(f"{command} --payload-body foot", status=2)
 
 
 @pytest.mark.long
@@ -542,11 +533,11 @@ def test_bad_input_is_one_line_and_exit_status_2(line, arm, folder, capsys):
     assert re.search(words, " ".join(shown.split()) if usage else shown)
 
 
-@pytest.mark.parametrize("name", ["forward_dynamics", "inverse_dynamics", "bias_force", "forward_kinematics"])
+@pytest.mark.parametrize("name", ["forward_dynamics", "forward_kinematics"])
 def test_export_writes_the_function(name, arm, folder, run):
     """Numbers in the test program are those of the library at the neutral configuration, without velocities and torques."""
     assert f"in out: {name}.h, {name}.o, {name}_test.c" in run(f"export {arm} --function {name} --out out")
-    model, inputs = jd.load_model(arm), {"forward_dynamics": 3, "inverse_dynamics": 3, "bias_force": 2}.get(name, 1)
+    model, inputs = jd.load_model(arm), 3 if name == "forward_dynamics" else 1
     wanted = getattr(jd, name)(model, *[jnp.zeros(3)] * inputs)
     numbers = re.search(r"expected_out\[\] = {(.*?)}", (folder / "out" / f"{name}_test.c").read_text())[1]
     np.testing.assert_allclose([float.fromhex(x) for x in numbers.split(", ")], wanted.ravel(), rtol=1e-12, atol=1e-12)
@@ -614,22 +605,14 @@ def test_info_of_a_file_with_a_loop(four_bar, run):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "digits", [5, pytest.param(8, marks=pytest.mark.slow), pytest.param(17, marks=pytest.mark.slow)]
-)
-def test_info_says_which_rows_repeat_others(digits, folder, run):
-    """Bennett's linkage as a file of so many digits: by which its dependent rows are open where it moves."""
+def test_info_says_which_rows_repeat_others(folder, run):
+    """Bennett's linkage as a file of five digits: by which its dependent rows are open where it moves."""
     path, number = folder / "bennett.sdf", re.compile(r"(?<=[ >'])-?\d+\.\d+(e-?\d+)?(?=[ <])")
-    path.write_text(number.sub(lambda x: f"{float(x[0]):.{digits}g}", bennett()))
+    path.write_text(number.sub(lambda x: f"{float(x[0]):.5g}", bennett()))
     text = run("info", path)
     assert "Degrees of freedom after constraints: 1 of 3\nRedundant rows, which jd.simulate leaves out" in text
     gap = float(re.search(r"hinge_\d: 3 of 5, which stay open by up to (\S+) m or rad", text)[1])
-    assert 10.0 ** -(digits + 3) <= gap + 1e-16 and gap <= 10.0**-digits + 1e-14
-
-
-def test_info_counts_couplings(panda, run):
-    text = run("info", panda)
-    assert "Degrees of freedom after constraints: 8 of 9" in text and "gear" in text
+    assert 1e-8 <= gap + 1e-16 and gap <= 1e-5 + 1e-14
 
 
 @pytest.mark.long
@@ -688,21 +671,19 @@ def test_info_expands_xacro(folder, run):
 @pytest.mark.long
 def test_calibrate(folder, run):
     """Poses are chosen, measured on an arm with other lengths, and give these back; held-out poses show the noise."""
-    arm = """<robot name="arm"><link name="base"/>{links}</robot>"""
-    link = """<link name="l{i}"><inertial><mass value="1"/>
-      <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-      <joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="l{i}"/>
-      <origin xyz="{x} 0.1 0.3" rpy="0.3 0 0"/>
-      <axis xyz="{axis}"/><limit lower="-2" upper="2" effort="9" velocity="9"/></joint>"""
 
     def write(name, stretch):
-        links = [
-            link.format(
-                i=i, parent=f"l{i - 1}" if i else "base", x=0.1 + stretch * i, axis=("0 0 1", "0 1 0", "1 0 0")[i]
-            )
-            for i in range(3)
-        ]
-        (folder / name).write_text(arm.format(links="".join(links)))
+        builder = jd.ModelBuilder("arm").add_body("base", joint="fixed")
+        limits = {"lower": -2.0, "upper": 2.0, "effort_limit": 9.0, "velocity_limit": 9.0}
+        for i, axis in enumerate(((0, 0, 1), (0, 1, 0), (1, 0, 0))):
+            options = {
+                "axis": axis,
+                "pose": ((0.1 + stretch * i, 0.1, 0.3), (0.3, 0, 0)),
+                "joint_name": f"j{i}",
+            } | limits
+            parent, ball = f"l{i - 1}" if i else "base", jd.inertia.sphere(1.0, 0.5)
+            builder.add_body(f"l{i}", parent, inertia=ball, **options)
+        jd.save_urdf(builder.build(), folder / name)
 
     write("nominal.urdf", 0.0)
     write("true.urdf", 0.004)

@@ -1,4 +1,4 @@
-"""The README of the compiler: its example runs as it is printed, and its table lists the public names."""
+"""The README of the compiler: its example runs as it is printed."""
 
 import re
 from pathlib import Path
@@ -24,13 +24,3 @@ def test_example():
     laplacian = np.trace(names["hessian"](points), axis1=1, axis2=2)
     np.testing.assert_allclose(laplacian, 0, atol=1e-14)
     assert float(names["quotient"]((), jnp.asarray(0.0))) == 1
-
-
-def test_table_lists_the_public_names():
-    table = TEXT[TEXT.index("## Public names") : TEXT.index("## What a function has to be")]
-    listed = set(
-        re.findall(r"`(\w+)`", "".join(row.split("|")[1] for row in table.splitlines() if row.startswith("| `")))
-    )
-    public = {name for name in vars(jaxdyn.compile) if not name.startswith("_")}
-    modules = {path.stem for path in Path(jaxdyn.compile.__file__).parent.iterdir()}
-    assert listed - {"batch", "known", "kernels", "repair"} == public - modules

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from jax._src.lax import lax as of_jax
 from kernel_helpers import native, quick, refuse
 
 from jaxdyn import compile as backend
@@ -111,7 +112,8 @@ UNARY = {
     "integer_pow": lambda x: x**5, "inverse": lambda x: x**-3, "copy": partial(jnp.array, copy=True),
 }  # fmt: skip
 POSITIVE = {  # of numbers between 0 and 1
-    "sqrt": jnp.sqrt, "rsqrt": lax.rsqrt, "log": jnp.log, "log1p": jnp.log1p, "asin": jnp.arcsin, "acos": jnp.arccos,
+    "sqrt": jnp.sqrt, "rsqrt": lax.rsqrt, "log": jnp.log, "log1p": jnp.log1p, "log2": jnp.log2, "asin": jnp.arcsin,
+    "acos": jnp.arccos,
 }  # fmt: skip
 BINARY = {
     "add": jnp.add, "sub": jnp.subtract, "mul": jnp.multiply, "div": jnp.divide, "max": jnp.maximum, "min": jnp.minimum,
@@ -173,6 +175,16 @@ def _own_vjp(x):
 
 _own_vjp.defvjp(lambda x: (3 * x, None), lambda _, g: (7 * g,))
 
+
+@jax.custom_vjp
+def _constant_with_a_rule():
+    return jnp.ones(())
+
+
+_constant_with_a_rule.defvjp(lambda: (jnp.ones(()), None), lambda _, __: ())
+
+# Comparisons of the total order, which jax has since 0.12.
+ORDERS = [getattr(of_jax, name) for name in ("lt_to_p", "le_to_p") if hasattr(of_jax, name)]
 PLACES = np.array([2, 0, 2])
 PAIRS = np.array([[1, 2], [0, 3], [1, 2]])
 MASK = np.array([True, False, True, True])
@@ -188,9 +200,13 @@ def _scanned(x, reverse=False):
 
 OPERATIONS = {
     "comparisons": lambda x: (x > 0, x >= x[:, :1], x < 0.1, x <= 0.1, x == x[:1, :1], x != x[:1, :1], jnp.isfinite(x)),
+    "total order": lambda x: (x, *(order.bind(x, x[::-1]) for order in ORDERS)),
     "logic": lambda x: ((x > 0) & (x < 1), (x > 0) | (x < -1), ~(x > 0)),
     "compared flags": lambda x: ((x > 0) == (x < 1), (x > 0) < (x < 1), (x > 0) >= (x < 1)),
     "flags": lambda x: (jnp.maximum(x > 0, x > 1), jnp.minimum(x > 0, x > 1), (x > 0).max(), (x > 0).sum()),
+    "known numbers": lambda x: (
+        jnp.maximum(k := jnp.arange(3.0), 1.0), jnp.stack([k, x[0, :3]]).max(1), jnp.clip(k, 0.5, 1.5), jnp.arctan2(k, 2.0)
+    ),
     "select": lambda x: (jnp.where(x > 0, x, -x), jnp.where(MASK, x, 1.0), jnp.where(x > 0, 2.0, 3.0)),
     "several": lambda x: lax.select_n(jnp.asarray(PLACES), x[0, :3], x[1, :3], x[2, :3]),
     "clamp": lambda x: (jnp.clip(x, -0.3, 0.4), lax.clamp(x[0, 0], x, x[0, 1])),
@@ -204,6 +220,7 @@ OPERATIONS = {
     "joins": lambda x: (jnp.concatenate([x, x + 1]), jnp.stack([x, 2 * x], 1), jnp.split(x, 2, 1), jnp.unstack(x)),
     "pad": lambda x: (lax.pad(x, 0.5, [(1, 2, 0), (0, 0, 1)]), jnp.pad(x, 1)),
     "broadcast": lambda x: (jnp.broadcast_to(x, (2, 3, 4)), x[:, None] + x[None], jnp.full((2, 2), x[0, 0])),
+    "polynomial": lambda x: lax.polynomial(x[0], [1.0, x[1], -2.0]) if hasattr(lax, "polynomial") else x,  # since 0.12
     "iota": lambda x: jnp.arange(12.0).reshape(3, 4) + x,
     "gather": lambda x: (x[PAIRS[:, 0], PAIRS[:, 1]], x[PLACES], x[:, PLACES], x[-1], x[PLACES[:, None], PLACES[None]]),
     "take": lambda x: (jnp.take(x, PLACES, 1), jnp.take_along_axis(x, PAIRS, 1), x.at[PLACES, 9].get(mode="clip")),
@@ -225,6 +242,7 @@ OPERATIONS = {
     "while": lambda x: lax.while_loop(lambda s: s[0] < 4, lambda s: (s[0] + 1, s[1] * 0.9), (0, x)),
     "cond": lambda x: (lax.cond(np.asarray(True), jnp.sin, jnp.cos, x), lax.switch(np.asarray(1), [jnp.sin, jnp.tan], x)),
     "inner": lambda x: (jax.checkpoint(jnp.sin)(x), jax.jit(jnp.cos)(x), _own_jvp(x), lax.stop_gradient(x)),
+    "reverse rule": lambda x: x + _constant_with_a_rule(),
     "barrier": lambda x: lax.optimization_barrier((x, 2 * x)),
     "derivatives": lambda x: (jax.grad(lambda x: jnp.sum(jnp.sin(x) * x**2))(x), jax.hessian(lambda z: (z**3).sum())(x[0])),
     "linear solve": lambda x: lax.custom_linear_solve(
@@ -434,17 +452,6 @@ def test_functions_with_rules_of_their_own_keep_them():
     np.testing.assert_allclose(jax.jit(jax.jacrev(lambda x: f(x)[0]))(x), 5 * np.eye(3))
     run = jax.jit(jax.grad(lambda x: backend.kernel(lambda _, x: _own_vjp(x).sum())((), x)))
     np.testing.assert_allclose(run(x), 7 * np.ones(3))
-
-
-def test_the_rule_that_is_given_is_taken():
-    def rule(_, x, steps):
-        return None if steps[0] is None else 9.0 * steps[0]
-
-    def f(x):
-        return backend.kernel(lambda _, x: x * x, derivative=rule)((), x)
-
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(f))(normal(2)), 9 * np.eye(2))
-    np.testing.assert_allclose(jax.jit(jax.jacrev(f))(normal(2)), 9 * np.eye(2))
 
 
 def test_only_what_moves_is_differentiated():
@@ -746,13 +753,11 @@ def test_modes(monkeypatch):
     with backend.compilation("auto"):
         assert has_kernel()
     monkeypatch.setenv("JAXDYN_COMPILATION", "fast")
-    with pytest.raises(
-        ValueError, match="environment's JAXDYN_COMPILATION is 'fast'; choose from 'auto', 'native', 'plain'"
-    ):
+    with pytest.raises(ValueError, match="JAXDYN_COMPILATION is 'fast'"):
         has_kernel()
     for wrong in ("machine", ""):
         with (
-            pytest.raises(ValueError, match=r"compilation: mode is .*'auto', 'native', 'plain'"),
+            pytest.raises(ValueError, match=r"mode is .*'native'"),
             backend.compilation(wrong),
         ):
             pass
@@ -899,7 +904,7 @@ def test_a_kernel_that_is_missing_is_said():
     slot = next(entry for entry in target._table if entry.hash == number)
     slot.hash = 1  # nobody's
     try:
-        with pytest.raises(jax.errors.JaxRuntimeError, match="compiled by another process"):
+        with pytest.raises(jax.errors.JaxRuntimeError, match="by another process"):
             jax.block_until_ready(run(x))
     finally:
         slot.hash = number

@@ -93,7 +93,7 @@ def test_a_second_run_finds_what_its_numbers_do_not_decide(monkeypatch):
     longer = eqx.tree_at(lambda x: x.system.home, scene, scene.system.home * 1.0)
     np.testing.assert_array_equal(jd.simulate(longer, q, v, ts).q, first)
     assert len(seen) == 2
-    with pytest.raises(ValueError, match="not on the constraints"):
+    with pytest.raises(ValueError, match="on the constraints"):
         jd.simulate(scene, q + 0.1 * jnp.arange(3.0), v, ts)
     with pytest.raises(ValueError, match="q0 is nan"):
         jd.simulate(scene, q.at[0].set(jnp.nan), v, ts)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jax import lax
 from jax.scipy.linalg import block_diag
+from kernel_helpers import quick
 
 import jaxdyn as jd
 from jaxdyn.compile import mode
@@ -78,15 +79,16 @@ def test_kernels_of_unknown_places(case):
     loose = 1e5 if case.startswith(("solve", "inverse")) else 1.0
     x = jnp.asarray(np.random.default_rng(1).uniform(-0.7, 1.6, (40, 4)))
     x = x.at[0, 1].set(0.0) if "sorted" in case else x  # on a knot; elsewhere a tie, whose derivative is a choice
-    np.testing.assert_allclose(
-        jax.jit(jax.vmap(lambda x: fast(None, x)))(x), jax.vmap(function)(x), rtol=loose * 1e-13, atol=loose * 1e-14
-    )
-    if case not in ("argmax of NaN", "filled"):
-        for derivative in (jax.jacfwd, jax.jacrev):
-            found = jax.jit(jax.vmap(derivative(lambda x: fast(None, x))))(x)
-            np.testing.assert_allclose(
-                found, jax.jit(jax.vmap(jax.jacfwd(function)))(x), rtol=loose * 1e-12, atol=loose * 1e-13
-            )
+    has_derivatives = case not in ("argmax of NaN", "filled")
+
+    def all_of(f):
+        modes = (jax.jacfwd, jax.jacrev) if has_derivatives else ()
+        return quick(jax.vmap(lambda x: (f(x), *(mode(f)(x) for mode in modes))))
+
+    (value, *found), (wanted, *slopes) = all_of(lambda x: fast(None, x))(x), all_of(function)(x)
+    np.testing.assert_allclose(value, wanted, rtol=loose * 1e-13, atol=loose * 1e-14)
+    for slope in found:
+        np.testing.assert_allclose(slope, slopes[0], rtol=loose * 1e-12, atol=loose * 1e-13)
 
 
 def law_by_sorting(q, v, t):
@@ -109,9 +111,9 @@ def test_message_names_the_users_function_once(monkeypatch, caplog):
 
     for law in (law_by_searching, law_by_sorting):
         caplog.clear()
-        gradient = jax.grad(end)(start[0], law)
-        end(start[0], law)
-        assert np.isfinite(gradient).all()
+        assert np.isfinite(end(start[0], law))
+        if law is law_by_sorting:
+            assert np.isfinite(jax.grad(end)(start[0], law)).all()
         messages = [record.getMessage() for record in caplog.records if record.name == "jaxdyn"]
         if law is law_by_searching:
             assert not (messages and HAS_SEARCHES)

@@ -55,6 +55,15 @@ def run_c(folder, name: str, compile_command: list[str] | None = None, runner: t
     return ran.stdout
 
 
+def status_of(exported, *arrays, batch: bool = True) -> int:
+    """Call the function in C, or that of batches, with arguments and arrays for its results; the status."""
+    code = code_of(exported.module("c", standalone.resolve_target("host").lanes))
+    sizes = [ctypes.c_int64] if batch else []
+    kind = ctypes.CFUNCTYPE(ctypes.c_int, *sizes, *[ctypes.c_void_p] * len(arrays))
+    function = kind(code.address(f"{exported.name}_batch" if batch else exported.name))
+    return function(*([len(arrays[0])] if batch else []), *(x.ctypes.data for x in arrays))
+
+
 def test_calls_from_numpy_equal_the_library(arm, exported):
     np.testing.assert_allclose(exported(X, V, TAU), jd.forward_dynamics(arm, *STATE), rtol=1e-12)
     # The independent answer: inverse dynamics by another recursion gives the torques back.
@@ -129,14 +138,11 @@ def test_header_names_joints_units_sizes_and_stack(exported, tmp_path):
 
 
 def test_batch_over_vector_lanes_equals_single_samples(exported):
-    lanes = standalone.resolve_target("host").lanes
-    code = code_of(exported.module("c", lanes))
     for n in (0, 1, 3, 13):
         rng = np.random.default_rng(n)
         q, v, tau = (np.ascontiguousarray(rng.normal(size=(n, 7))) for _ in range(3))
         out = np.full((n, 7), np.nan)
-        function = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, *[ctypes.c_void_p] * 4)(code.address("arm_fd_batch"))
-        assert function(n, *(x.ctypes.data for x in (q, v, tau, out))) == 0
+        assert status_of(exported, q, v, tau, out) == 0
         expected = np.array([exported(*row) for row in zip(q, v, tau, strict=True)]).reshape(n, 7)
         np.testing.assert_allclose(out, expected, rtol=1e-11, atol=1e-11)
 
@@ -157,24 +163,10 @@ def test_single_precision(tmp_path):
     got = exported(x)
     assert got.dtype == np.float32
     np.testing.assert_allclose(got, np.sin(x.astype(float)) * x[::-1], rtol=1e-6)
+    slopes = np.diag(np.cos(x) * x[::-1]) + np.diag(np.sin(x))[:, ::-1]
+    np.testing.assert_allclose(exported.jacobian(x)[0], slopes, rtol=1e-6)
     assert "const float x[2]" in (exported.save(tmp_path) / "single.h").read_text()
     run_c(tmp_path, "single")
-
-
-def test_forward_dynamics_in_single_precision(arm, exported, tmp_path):
-    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arm)
-    x = [y.astype(np.float32) for y in (X, V, TAU)]
-    small = jd.export(
-        lambda q, v, tau: jd.forward_dynamics(single, q, v, tau), *x, name="small", derivatives="jacobian"
-    )
-    assert small(*x).dtype == np.float32
-    np.testing.assert_allclose(
-        small(*x), exported(X, V, TAU), rtol=1e-3
-    )  # the arm's mass matrix loses four digits of seven
-    for got, expected in zip(small.jacobian(*x), exported.jacobian(X, V, TAU), strict=True):
-        np.testing.assert_allclose(got, expected, atol=1e-3 * np.abs(expected).max())
-    small.save(tmp_path)
-    run_c(tmp_path, "small")
 
 
 @pytest.mark.long
@@ -223,11 +215,8 @@ def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
     np.testing.assert_allclose(exported.jacobian(q * 0, q * 0, q)[2], np.linalg.inv(M), rtol=1e-10)
 
     rows = np.stack([q, q * 0, q, -q, q * 0]), np.zeros((5, 2)), np.tile(q, (5, 1))
-    lanes = standalone.resolve_target("host").lanes
-    code = code_of(exported.module("c", lanes))
-    batch = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, *[ctypes.c_void_p] * 4)(code.address("crossing_batch"))
     out = np.full((5, 2), np.nan)
-    assert batch(5, *(x.ctypes.data for x in (*rows, out))) == 0
+    assert status_of(exported, *rows, out) == 0
     np.testing.assert_allclose(out, [exported(*row) for row in zip(*rows, strict=True)], rtol=1e-11)
 
 
@@ -238,7 +227,7 @@ def test_rows_that_contradict_each_other_give_a_status(tmp_path):
         lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration, q + 0.5, v * 0, q, name="crossing"
     )
     assert jd.constrained_dynamics(scene, *map(jnp.asarray, (q, v, q))).result == jd.RESULTS.contradictory_rows
-    with pytest.raises(FloatingPointError, match="crossing: no regular solution at this sample"):
+    with pytest.raises(FloatingPointError, match="no regular solution"):
         exported(q, v, q)
     exported.save(tmp_path)
     assert "1 where the sample has no regular solution" in (tmp_path / "crossing.h").read_text()
@@ -269,19 +258,11 @@ def test_rows_without_a_clear_rank_give_a_status():
 def test_results_that_are_not_finite_have_a_status(tmp_path):
     exported = jd.export(lambda x: (jnp.log(x), 1 / x), np.zeros(2), name="f", batch=True)
     assert np.isinf(exported(np.zeros(2))[0]).all()
-    lanes = standalone.resolve_target("host").lanes
-    code = code_of(exported.module("c", lanes))
-    one, many = (
-        ctypes.CFUNCTYPE(ctypes.c_int, *kinds)(code.address(name))
-        for name, kinds in (("f", [ctypes.c_void_p] * 3), ("f_batch", [ctypes.c_int64, *[ctypes.c_void_p] * 3]))
-    )
     x, out = np.ones((5, 2)), np.zeros((2, 5, 2))
-    assert one(x.ctypes.data, *(y.ctypes.data for y in out)) == 0
-    assert many(5, x.ctypes.data, *(y.ctypes.data for y in out)) == 0
+    assert status_of(exported, x, *out) == status_of(exported, x, *out, batch=False) == 0
     for bad in (0.0, -1.0, np.nan, np.inf):
         x[3, 1] = bad
-        assert one(x[3].ctypes.data, *(y.ctypes.data for y in out)) == 2
-        assert many(5, x.ctypes.data, *(y.ctypes.data for y in out)) == 2
+        assert status_of(exported, x, *out) == status_of(exported, x[3], *out, batch=False) == 2
     exported.save(tmp_path)
     run_c(tmp_path, "f")  # which expects the status at its examples
 
@@ -317,12 +298,9 @@ def test_redundant_rows(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "constrained", [pytest.param(False, marks=pytest.mark.slow), True], ids=["free", "constrained"]
-)
-def test_a_step_of_an_integrator(constrained, tmp_path):
-    scene = jd.scenes.four_bar() if constrained else jd.Scene(jd.robots.ur5())
-    q, v = map(np.asarray, jd.scenes.four_bar.start()) if constrained else (X[:6], V[:6])
+def test_a_step_of_an_integrator(tmp_path):
+    scene = jd.scenes.four_bar()
+    q, v = map(np.asarray, jd.scenes.four_bar.start())
     tau = np.linspace(0.5, 1, scene.nv)
     step = jd.stepper(scene, 0.002, substeps=2)
     exported = jd.export(lambda q, v, tau: step((q, v), tau), q, v, tau, name="step")
@@ -427,7 +405,7 @@ def test_a_step_of_an_arm_behind_drives(tmp_path):
     exported.save(tmp_path)
     run_c(tmp_path, "driven")
     limited = jd.stepper(jd.Scene(scene.system, forces=(*forces, jd.forces.EffortLimits(0.8))), 0.004)
-    with pytest.raises(ValueError, match=r"its steps end at the kinks of .*leave these forces out"):
+    with pytest.raises(ValueError, match="leave these forces out"):
         jd.export(lambda q, v, z, tau: limited((q, v, z), tau), q, v, z, tau, name="limited")
 
 
@@ -453,9 +431,7 @@ def test_jacobians_by_columns_equal_those_that_are_written_out(arm, exported, mo
 
 def test_jax_export_says_what_to_do(arm):
     function = jax.jit(lambda q: jd.gravity_force(arm, q))
-    with pytest.raises(
-        ValueError, match=r"within jd.compilation\('plain'\), or write an object file for C with jd.export"
-    ):
+    with pytest.raises(ValueError, match=r"jd.compilation\('plain'\), .*jd.export"):
         jax.export.export(function)(STATE[0])
     with jd.compilation("plain"):
         plain = jax.export.export(function)(STATE[0])
@@ -533,6 +509,8 @@ def test_every_target_compiles(exported, tmp_path, target):
         assert binary[:4] == b"\0asm"
     else:
         assert binary[:4] == b"\x7fELF" and int.from_bytes(binary[18:20], "little") == machines.get(target, 62)
+    if target == "cortex-m7":  # the runtime has no more
+        assert all(name in LIBM or name.startswith("__aeabi") for name in undefined_symbols(tmp_path / "arm_fd.o"))
 
 
 def test_baseline_of_x86_64_runs_here(exported, tmp_path):
@@ -593,12 +571,6 @@ def test_maxima_on_cortex_m(tmp_path):
             np.testing.assert_array_equal(got, expected)
 
 
-def test_cortex_m_calls_only_what_the_runtime_has(exported, tmp_path):
-    exported.save(tmp_path, target="cortex-m7")
-    names = undefined_symbols(tmp_path / "arm_fd.o")
-    assert all(name in LIBM or name.startswith("__aeabi") for name in names), names
-
-
 # --- refusals ---
 
 
@@ -615,13 +587,12 @@ def test_cortex_m_calls_only_what_the_runtime_has(exported, tmp_path):
             lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((7,), float), x),
             (X,),
             {"name": "f"},
-            "function cannot be exported: it has pure_callback",
+            "it has pure_callback",
         ),
-        (lambda x: x[x > 0], (X,), {"name": "f"}, "cannot be exported: it has shapes, branches or conversions"),
-        (lambda x: x if x[0] > 0 else -x, (X,), {"name": "f"}, "cannot be exported: it has shapes, branches"),
-        (lambda x: jnp.asarray(np.sin(x)), (X,), {"name": "f"}, "cannot be exported: it has shapes, branches"),
-        (lambda x: jax.lax.complex(x, x), (X,), {"name": "f"}, "cannot be exported: it has an array of complex128"),
-        (lambda x: jnp.argsort(x), (X,), {"name": "f"}, "cannot be exported: it has sort"),
+        (lambda x: x[x > 0], (X,), {"name": "f"}, "it has shapes, branches"),
+        (lambda x: x if x[0] > 0 else -x, (X,), {"name": "f"}, "it has shapes, branches"),
+        (lambda x: jax.lax.complex(x, x), (X,), {"name": "f"}, "array of complex128"),
+        (lambda x: jnp.argsort(x), (X,), {"name": "f"}, "it has sort"),
     ],
 )
 def test_refusals(function, examples, options, message):
@@ -640,7 +611,7 @@ def test_names_that_meet_others(tmp_path):
 def test_doubles_without_double_precision_are_refused():
     jax.config.update("jax_enable_x64", False)
     try:
-        with pytest.raises(ValueError, match=r"examples: x has dtype float64, and JAX computes in float32 here"):
+        with pytest.raises(ValueError, match="x has dtype float64"):
             jd.export(lambda x: 2 * x, X, name="f")
         assert jd.export(lambda x: 2 * x, X.astype(np.float32), name="f")(X.astype(np.float32)).dtype == np.float32
     finally:
@@ -656,7 +627,7 @@ def test_refusals_of_saving_and_calling(exported, tmp_path):
     with pytest.raises(ValueError, match="cannot be written"):
         exported.save(tmp_path / "file" / "folder")
     assert not (tmp_path / "a").exists()
-    with pytest.raises(ValueError, match=r"an argument has shape \(3,\), the example had \(7,\)"):
+    with pytest.raises(ValueError, match=r"shape \(3,\), .*\(7,\)"):
         exported(X[:3], V, TAU)
     os.chmod(tmp_path, 0o500)
     if not os.access(tmp_path, os.W_OK):  # root may write everywhere
@@ -664,9 +635,9 @@ def test_refusals_of_saving_and_calling(exported, tmp_path):
             exported.save(tmp_path)
     os.chmod(tmp_path, 0o700)
     assert sorted(x.name for x in tmp_path.iterdir()) == ["file"], "nothing is half written"
-    with pytest.raises(ValueError, match="takes 3 arguments, and was given 2"):
+    with pytest.raises(ValueError, match=r"takes 3 .*given 2"):
         exported(X, V)
-    with pytest.raises(ValueError, match="was exported without its Jacobian"):
+    with pytest.raises(ValueError, match="without its Jacobian"):
         jd.export(lambda x: x, X, name="f").jacobian(X)
 
 
@@ -683,10 +654,7 @@ def test_solutions_of_equations_and_what_to_write_in_place_of_other_factors():
     def decomposed(x):
         return jnp.linalg.svd(jnp.outer(x, x) + jnp.eye(4), compute_uv=False)
 
-    words = (
-        r"it has svd, in .*decomposed \(test_export.py:\d+\); decompose a constant matrix once, outside of the function"
-    )
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=r"svd, in .*decomposed \(test_export.py:\d+\); decompose"):
         jd.export(decomposed, x, name="decomposed")
 
 

@@ -79,10 +79,10 @@ def test_chosen_links_and_refusals(urdf):
     scene = silent(urdf, contacts=["sphere", "capsule"])
     assert set(touching_of(scene)) == {"sphere", "capsule 0", "capsule 1"}
     assert not touching_of(silent(urdf))
-    with pytest.raises(ValueError, match=r"link 'sphre' is unknown \(did you mean sphere.*\)"):
+    with pytest.raises(ValueError, match=r"'sphre' .*mean sphere"):
         silent(urdf, contacts=["sphre"])
     for wrong in ("floor", 3, [1]):
-        with pytest.raises(ValueError, match="give 'ground', a list of names of links"):
+        with pytest.raises(ValueError, match="give 'ground'"):
             silent(urdf, contacts=wrong)
     with pytest.raises(ValueError, match=r"contacts\['sphere'\] is 0"):
         silent(urdf, contacts={"sphere": 0})
@@ -101,7 +101,7 @@ def test_ground_for_a_whole_robot_asks_for_the_links_that_touch(tmp_path):
     ]
     path = tmp_path / "robot.urdf"
     path.write_text(f'<robot name="r"><link name="base"/>{"".join(parts)}</robot>')
-    with pytest.raises(ValueError, match=r"'ground' gives 72 contacts, of the links leg 0, leg 1.*List the links"):
+    with pytest.raises(ValueError, match=r"72 contacts.*List the links"):
         silent(path, contacts="ground")
     assert len(touching_of(silent(path, contacts=links))) == 72
     assert len(touching_of(silent(path, contacts=dict.fromkeys(links, 4)))) == 36
@@ -168,11 +168,7 @@ def test_sdf_shapes_touch_a_plane(tmp_path):
     gap = float(touching["m::b 4"].contact.position(scene.system, q, 0.0)[0])
     np.testing.assert_allclose(gap, 0.6 * 0.5 + 0.8 * 0.9 - np.hypot(0.06, 0.24), atol=1e-15)
     lines = "; ".join(scene.not_taken)
-    for words in (
-        "<cone> of link 'm::b'",
-        "friction of collisions in a second direction: m::b",
-        "restitution of collisions: m::b",
-    ):
+    for words in ("<cone> of link 'm::b'", "in a second direction: m::b", "restitution of collisions: m::b"):
         assert words in lines
     assert "<collision> of links" not in lines
     assert "<collision> of links: floor::slab, m::b" in "; ".join(silent(path).not_taken)
@@ -227,7 +223,7 @@ def test_mjcf_geoms_touch_a_plane(tmp_path):
         np.testing.assert_allclose(ours[k], theirs[g], atol=1e-7 if g == 5 else 1e-10)  # meshes are in float32
     rules = '<contact><pair geom1="floor" geom2="ball" friction="0.3 0.3 0 0 0"/><exclude body1="world" body2="d"/></contact>'
     path.write_text(MJCF.format(ground=FLOOR, more=rules))
-    with pytest.warns(jd.io.NotTakenWarning, match=r"collision shapes without contacts: world \(fixed\)"):
+    with pytest.warns(jd.io.NotTakenWarning, match=r"world \(fixed\)"):
         touching = touching_of(jd.load(path, contacts=["c", "d"]))
     assert set(touching) == {"c"} and float(touching["c"].coefficient) == 0.3
 

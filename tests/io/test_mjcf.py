@@ -113,6 +113,8 @@ def test_names_of_bodies_joints_and_frames(mixed):
     assert model.body_names == ("rod", "base", "arm_z", "arm_a", "arm_m", "body3_joint")
     assert {"arm", "imu", "imu_site", "imu2", "body3"} <= set(model.frame_names)
     assert [constraint.name for constraint in scene.constraints] == ["c", "w", "j", "cubic", "held", "tt"]
+    kinds = [type(force).__name__ for force in scene.forces]
+    assert kinds == ["JointSpring", "JointDamping", "CoulombFriction", "TendonForce"]
     np.testing.assert_allclose(model.gravity, [0.3, -0.2, -9.7])
     np.testing.assert_allclose(model.armature[model.topology.v_slices[2]], 0.01 + 9 * 0.02)
     np.testing.assert_allclose(model.lower[model.topology.q_slices[4]], -1)
@@ -138,20 +140,9 @@ def test_what_is_not_taken_is_named_by_a_warning(mixed):
         jd.load(path)
     assert len(caught) == 1
     text = str(caught[0].message)
-    for part in (
-        "robot.xml",
-        "muscles: muscle",
-        "contact geometry of bodies: world, arm",
-        "spatial tendons: cord",
-        "off",
-    ):
+    for part in ("robot.xml", "muscles: muscle", "geometry of bodies: world, arm", "spatial tendons: cord", "off"):
         assert part in text
     assert all(line in text for line in scene.not_taken)
-
-
-def test_friction_is_smoothed_and_springs_are_forces(mixed):
-    kinds = [type(force).__name__ for force in mixed[1].forces]
-    assert kinds == ["JointSpring", "JointDamping", "CoulombFriction", "TendonForce"]
 
 
 def test_a_file_without_anything_else_warns_of_nothing(tmp_path):
@@ -212,10 +203,7 @@ def test_missing_meshes_and_textures_are_left_out(tmp_path):
         ("<mujoco><worldbody><body></worldbody></mujoco>", ("robot.xml:1", "malformed XML")),
         ('<mujoco>\n<worldbody><body foo="3"/></worldbody></mujoco>', ("robot.xml:2", "foo")),
         ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", ("robot.xml:1", "mass")),
-        (
-            f"<mujoco><worldbody>{TWINS}</worldbody></mujoco>",
-            ("robot.xml", "singular", "'h'"),
-        ),
+        (f"<mujoco><worldbody>{TWINS}</worldbody></mujoco>", ("robot.xml", "singular", "'h'")),
         ('<!DOCTYPE x [<!ENTITY a "b">]><mujoco model="&a;"/>', ("robot.xml:1", "entity 'a'", "refused")),
     ],
 )
@@ -240,11 +228,11 @@ def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):
 def test_controls_of_another_number_are_refused(mixed):
     _, scene = mixed
     q = scene.starts["reference"].q
-    with pytest.raises(ValueError, match=r"control has shape \(2,\), expected \(6,\).*m1, p1"):
+    with pytest.raises(ValueError, match=r"control .*\(6,\).*m1, p1"):
         scene.actuators(scene.system, q, jnp.zeros(scene.nv), jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"activation has shape None, expected \(1,\).*stateful"):
+    with pytest.raises(ValueError, match=r"activation .*\(1,\).*stateful"):
         scene.actuators(scene.system, q, jnp.zeros(scene.nv), jnp.zeros(6))
-    with pytest.raises(ValueError, match=r"activation has shape \(2,\), expected \(1,\)"):
+    with pytest.raises(ValueError, match=r"activation .*\(2,\).*\(1,\)"):
         scene.actuators.drive(lambda q, v, t: jnp.zeros(6), jnp.zeros(2))
 
 
@@ -369,22 +357,6 @@ def _mass_matrix(m) -> np.ndarray:
     mujoco.mj_forward(m, data)
     mujoco.mj_fullM(m, data, M)
     return M
-
-
-@pytest.mark.slow
-def test_a_loop_of_a_file_assembles_from_a_rough_guess(tmp_path):
-    bars = """
-    <body name="crank"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02"/>
-      <body name="rod" pos="0 0 0.3"><joint name="b" axis="0 1 0"/>
-        <geom type="capsule" fromto="0 0 0 0.8 0 0" size="0.02"/></body></body>
-    <body name="rocker" pos="0.8 0 0"><joint name="c" axis="0 1 0"/>
-      <geom type="capsule" fromto="0 0 0 0 0 0.3" size="0.02"/></body>"""
-    rest = '<equality><connect body1="rod" body2="rocker" anchor="0.8 0 0"/></equality>'
-    scene = silent(of_body(tmp_path, bars, rest))
-    q = scene.starts["reference"].q + jnp.array([0.3, -0.2, 0.1])
-    assembly = jd.assemble(scene, q)
-    assert assembly.residual.max() < 1e-12
-    assert np.abs(assembly.q - scene.starts["reference"].q).max() > 0.1
 
 
 @pytest.mark.long

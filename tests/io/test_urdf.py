@@ -28,18 +28,17 @@ MENDED = {
 LOADED = [name for name in FILES if name not in MENDED or "mimic=" in MENDED[name]]
 MIMIC = ["panda_description/urdf/panda.urdf", "baxter_description/urdf/baxter.urdf"]
 ROUND_TRIPS = [
-    "panda_description/urdf/panda.urdf",
-    "centauro_description/urdf/centauro.urdf",  # siblings out of the order of their names
-    "tiago_pro_description/robots/tiago_pro.urdf",  # the same, and continuous joints
-    "g1_description/urdf/g1_29dof_rev_1_0.urdf",
-    "double_pendulum_description/urdf/double_pendulum_continuous.urdf",
-    "hector_description/robots/quadrotor_base.urdf",
+    ("panda_description/urdf/panda.urdf", False),  # with a joint that follows another one
+    (
+        "tiago_pro_description/robots/tiago_pro.urdf",
+        False,
+    ),  # siblings out of the order of their names, continuous joints
+    ("g1_description/urdf/g1_29dof_rev_1_0.urdf", True),
+    ("hector_description/robots/quadrotor_base.urdf", False),  # one body
+    ("hector_description/robots/quadrotor_base.urdf", True),
 ]
 INERTIAS = [
-    "g1_description/urdf/g1_29dof_rev_1_0.urdf",
-    "panda_description/urdf/panda.urdf",
     "talos_data/robots/talos_reduced.urdf",
-    "tiago_description/robots/tiago.urdf",
     "romeo_description/urdf/romeo_small.urdf",
     "pr2_description/urdf/pr2.urdf",
 ]
@@ -103,14 +102,19 @@ def assert_same_models(one, two, rtol=1e-12):
             np.testing.assert_allclose(b, a, rtol=rtol, atol=rtol * finite.max(initial=0.0), err_msg=name)
 
 
-@pytest.mark.parametrize("name", LOADED)
+def some(names: list[str], step: int) -> list:
+    """All of the names, of which others than every `step`-th run with the slow tests."""
+    return [
+        pytest.param(x, marks=pytest.mark.slow if i % step and x not in MENDED else ()) for i, x in enumerate(names)
+    ]
+
+
+@pytest.mark.parametrize("name", some(LOADED, 3))
 def test_robot_is_the_one_that_pinocchio_loads(name):
     assert_same_as_pinocchio(jd.load_model(Path(ROBOTS) / name), in_pinocchio(name))
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.slow if i % 6 else ()) for i, x in enumerate(LOADED)]
-)
+@pytest.mark.parametrize("name", some(LOADED, 6))
 def test_robot_with_floating_base_is_the_one_that_pinocchio_loads(name):
     model = jd.load_model(Path(ROBOTS) / name, floating_base=True)
     assert_same_as_pinocchio(model, in_pinocchio(name, floating=True))
@@ -181,7 +185,7 @@ def test_features_of_a_joint(urdf):
         '<dynamics damping="0.5" friction="0.25" armature="0.125"/>'
     )
     path = urdf(link("a"), joint("j", "a", "b", inside), link("b"), '<gazebo:thing x="1"/>', "<!-- seen -->")
-    with pytest.warns(jd.io.NotTakenWarning, match="unknown <gazebo:thing> in <robot>: r"):
+    with pytest.warns(jd.io.NotTakenWarning, match="unknown <gazebo:thing>"):
         model = jd.load_model(path, gravity=None)
     assert (model.name, model.gravity, model.joint_names, model.frame_names) == ("r", None, ("j",), ("b", "a"))
     np.testing.assert_allclose(model.screws[0], [0, 0, 0, 0, 0.6, 0.8], atol=1e-16)
@@ -288,7 +292,7 @@ def test_mimic_joints():
     ]
     np.testing.assert_array_equal(model.coupling_values, [[1.0, 0.0]])
     assert model.nv == 9
-    with pytest.raises(ValueError, match=r"panda_finger_joint2 \(follows panda_finger_joint1\); pass mimic='couple'"):
+    with pytest.raises(ValueError, match=r"panda_finger_joint2 .*mimic='couple'"):
         jd.load_model(panda, mimic="error")
     with pytest.raises(ValueError, match="mimic is 'follow'"):
         jd.load_model(panda, mimic="follow")
@@ -301,7 +305,7 @@ def test_mimic_joints():
     assert jd.load_model(panda, lock=["panda_finger_joint1"]).nv == 8
     with pytest.raises(ValueError, match="'panda_finger_joint2' follows 'panda_finger_joint1'"):
         jd.load_model(panda, mimic="couple", lock=["panda_finger_joint2"])
-    with pytest.raises(ValueError, match=r"'panda_finger_joint2' is held at .*0.01.* but follows"):
+    with pytest.raises(ValueError, match="'panda_finger_joint2' is held at"):
         jd.load_model(panda, mimic="couple", lock={"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.01})
 
 
@@ -338,16 +342,13 @@ def test_followers_of_fixed_joints_are_held_at_their_offset(urdf):
     assert held.joint_names == ("root_joint",)
     pose = jd.frame_pose(held, jnp.array([0.0, 0, 0, 1, 0, 0, 0]), "d")
     angle = 0.3 + 2 * 0.3 + 0.1
-    np.testing.assert_allclose(
-        pose[:2, :2], [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]], atol=1e-14
-    )
+    np.testing.assert_allclose(pose[:2, 0], [np.cos(angle), np.sin(angle)], atol=1e-14)
 
 
 COUPLED = joint("j", "a", "b", '<mimic joint="k"/>'), joint("k", "b", "c", "", "{}"), link("c")
 # name: (parts, line of the fault, message). The parts start on line 2; a joint has its ends on its second line.
 BAD_FILES = {
     "tags crossed": ((link("a"), "<link name='x'>", "</lonk>"), 4, "malformed XML: .*lonk"),
-    "not closed": ((link("a"), "<link name='x'>"), 4, "malformed XML"),
     "entity": ((link("a"), "<link name='&x;'/>"), 3, "malformed XML: undefined entity .*&x;"),
     "no links": ((), 1, "the robot has no <link>"),
     "link without name": ((link("a"), "<link/>"), 3, "a <link> has no name"),
@@ -358,21 +359,14 @@ BAD_FILES = {
     "no type": ((*TREE, '<joint name="j"><parent link="a"/><child link="b"/></joint>'), 4, "'j' has type None"),
     "no parent": ((*TREE, '<joint name="j" type="fixed"><child link="b"/></joint>'), 4, "'j' has no <parent>"),
     "no child": ((*TREE, '<joint name="j" type="fixed"><parent link="a"/></joint>'), 4, "'j' has no <child>"),
-    "parent without link": (
-        (*TREE, joint("j", "a", "b").replace('link="a"', "")),
-        5,
-        "<parent> of joint 'j' has no link",
-    ),
+    "parent without link": ((*TREE, joint("j", "a", "b").replace('link="a"', "")), 5, "<parent> .*has no link"),
     "unknown link": ((*TREE, joint("j", "a", "x")), 5, "joint 'j': the child link 'x' is not in the file"),
     "two roots": ((*TREE, link("c"), joint("j", "a", "b")), None, "2 root links: a, c; join them by a joint"),
     "two parents": (hinge("", joint("k", "a", "b")), 7, "'b' is the child of joints 'j' and 'k'"),
     "cycle": (hinge("", joint("k", "b", "a")), 7, "links a, b form a cycle"),
-    "cycle apart": ((*TREE, link("c"), joint("j", "b", "c"), joint("k", "c", "b")), 8, "links b, c form a cycle"),
-    "own parent": ((*TREE, joint("j", "b", "b")), 4, "links b form a cycle"),
     "text for numbers": (hinge('<origin xyz="1 2 x"/>'), 6, "xyz of <origin> of joint 'j' is '1 2 x'"),
     "two for three": (hinge('<axis xyz="1 2"/>'), 6, "'1 2'; give 3 finite numbers"),
     "NaN mass": ((link("a", SOLID.replace('"1"/>', '"nan"/>', 1)),), 2, "value of <mass> of link 'a' is 'nan'"),
-    "infinite limit": (hinge('<limit upper="inf"/>'), 6, "upper of <limit> of joint 'j' is 'inf'"),
     "negative mass": ((link("a", SOLID.replace('value="1"', 'value="-2"')),), 2, "link 'a': the mass is -2.0 kg"),
     "inertia with a gap": ((link("a", SOLID.replace('izz="1"', "")),), 2, "<inertia> of link 'a' has no izz"),
     "zero axis": (hinge('<axis xyz="0 0 0"/>'), 4, "joint 'j': axis is .*direction other than zero"),
@@ -381,23 +375,9 @@ BAD_FILES = {
     "no inertia": ((*TREE[:1], link("b", ""), joint("j", "a", "b")), None, "joint 'j' .*moves no inertia"),
     "mimic without joint": (hinge("<mimic/>"), 6, "<mimic> of joint 'j' has no joint"),
     "mimic of nothing": ((*TREE, COUPLED[0]), 4, "'j' follows 'k'; joint 'k' is unknown; .*mimic='ignore'"),
-    "mimic of floating": (
-        (*TREE, *(part.format("floating") for part in COUPLED)),
-        4,
-        "'j' follows 'k', but 'k' is free",
-    ),
-    "second inertial": (
-        (link("a", SOLID + SOLID),),
-        2,
-        "a second <inertial> of link 'a', the first is on line 2; keep one",
-    ),
-    "second axis": (
-        hinge('<axis xyz="1 0 0"/><axis xyz="0 1 0"/>'),
-        6,
-        "a second <axis> of joint 'j', the first is on line 6",
-    ),
+    "mimic of floating": ((*TREE, *(part.format("floating") for part in COUPLED)), 4, "but 'k' is free"),
+    "second inertial": ((link("a", SOLID + SOLID),), 2, "second <inertial> .*on line 2"),
     "negative effort": (hinge('<limit effort="-1"/>'), 6, "effort of <limit> of .*its magnitude"),
-    "negative velocity": (hinge('<limit velocity="-1"/>'), 6, "velocity of <limit> of .*its magnitude"),
 }
 
 
@@ -417,10 +397,7 @@ def test_bad_files(case, urdf):
         ("\n<mujoco/>", "robot.urdf:2: the root element is <mujoco>, expected <robot>"),
         ("<robot><link name='a'/></robot>", "robot.urdf:1: the robot has no name"),
         ('<robot xmlns:xacro="http://ros.org/xacro"/>', "robot.urdf:1: .*xacro IN > OUT"),
-        (
-            '<!DOCTYPE robot [\n<!ENTITY x "b">]><robot name="&x;"/>',
-            "robot.urdf:2: .*declares the entity 'x', which is refused",
-        ),
+        ('<!DOCTYPE robot [\n<!ENTITY x "b">]><robot name="&x;"/>', "robot.urdf:2: .*entity 'x'"),
     ],
 )
 def test_files_that_are_no_urdf(content, message, tmp_path):
@@ -445,9 +422,9 @@ def test_bad_arguments(urdf, tmp_path):
     for value, message in {(1.0, 2.0): r"has shape \(2,\)", np.nan: "nan.*finite", "up": "'up', expected"}.items():
         with pytest.raises(ValueError, match=f"value of joint 'elbow'.*{message}"):
             jd.load_model(path, lock={"elbow": value})
-    with pytest.raises(ValueError, match=r"its quaternion .* is zero"):
+    with pytest.raises(ValueError, match=r"quaternion .* is zero"):
         jd.load_model(path, floating_base=True, lock={"root_joint": np.zeros(7)})
-    with pytest.raises(ValueError, match=r"nowhere.urdf' cannot be read .*check the path"):
+    with pytest.raises(ValueError, match=r"nowhere.urdf' .*check the path"):
         jd.load_model(tmp_path / "nowhere.urdf")
     with pytest.raises(ValueError, match="cannot be read"):
         jd.load_model(tmp_path)
@@ -518,17 +495,14 @@ def saved(model, path, **options):
     return jd.load_model(path, gravity=model.gravity, **options)
 
 
-@pytest.mark.parametrize("name", ROUND_TRIPS)
-@pytest.mark.parametrize("floating", [False, True])
+@pytest.mark.parametrize(("name", "floating"), ROUND_TRIPS)
 def test_round_trip_of_robots(name, floating, tmp_path):
     model = jd.load_model(Path(ROBOTS) / name, floating_base=floating, mimic="couple")
     path = tmp_path / "out.urdf"
     again = saved(model, path, floating_base=floating, mimic="couple")
     assert_same_models(model, again)
     # Pinocchio reads the same robot from the file.
-    source = (
-        pin.buildModelFromUrdf(str(path), pin.JointModelFreeFlyer()) if floating else pin.buildModelFromUrdf(str(path))
-    )
+    source = in_pinocchio(path, floating)
     assert model.joint_names == tuple(source.names)[1:]
     for ours, theirs in zip(np.asarray(model.inertias), source.inertias[1:], strict=True):
         np.testing.assert_allclose(ours, theirs.toDynamicParameters(), atol=1e-13 * np.abs(ours).max(initial=1.0))
@@ -694,9 +668,7 @@ def test_warnings_point_at_the_line_of_the_caller(urdf):
             call()
         line = call.__code__.co_firstlineno
         assert {(one.filename, one.lineno) for one in caught} == {(__file__, line)}
-        assert len(caught) == (
-            3 if line == call.__code__.co_firstlineno and "load_model" not in call.__code__.co_names else 2
-        )
+        assert len(caught) == (2 if "load_model" in call.__code__.co_names else 3)
         (inertia,) = (one for one in caught if "triangle inequality" in str(one.message))
         assert f"{path}:" in str(inertia.message)
 
@@ -723,21 +695,23 @@ def test_xacro_files_are_expanded(tmp_path, monkeypatch):
         path.write_text(text)
         with pytest.raises(ValueError, match=f"{path}: xacro: .*{words}.*arguments="):
             jd.load(path)
+    path.write_text(XACRO.replace('ixx="1"', 'ixx="$(arg length)"'))
+    # Moments of 3, 1 and 1 kg m^2 break the triangle inequality.
+    ((name, problem),) = jd.io.urdf_inertia_report(path, arguments={"length": 3})
+    assert name == "b" and "inequality" in problem
     path.write_text(XACRO.replace('"2"', '"two"'))
-    with pytest.raises(ValueError, match=r"arm.urdf.xacro \(expanded\):\d+: value of <mass> of link 'b' is 'two'"):
+    with pytest.raises(ValueError, match=r"xacro \(expanded\):\d+: .* 'two'"):
         jd.load(path)
     monkeypatch.setitem(sys.modules, "xacro", None)
     with pytest.raises(ImportError, match=r"arm.urdf.xacro.*pip install jaxdyn\[xacro\]"):
         jd.load(path)
     plain = path.with_name("arm.urdf")
     plain.write_text("<robot name='a'><link name='b'/></robot>")
-    with pytest.raises(ValueError, match=r"arguments is .*no .xacro file"):
+    with pytest.raises(ValueError, match=r"arguments .*no .xacro"):
         jd.load(plain, arguments={"length": 1})
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.slow if i % 6 and x not in MENDED else ()) for i, x in enumerate(FILES)]
-)
+@pytest.mark.parametrize("name", some(FILES, 6))
 def test_load_takes_every_robot_or_says_how(name):
     path = Path(ROBOTS) / name
     with warnings.catch_warnings():
@@ -765,7 +739,7 @@ def test_arms_without_inertias_load_for_kinematics(tmp_path):
     """The error names the option, which counts for links that move; kinematics do not depend on it."""
     path = tmp_path / "arm.urdf"
     path.write_text(ARM_WITHOUT_INERTIAS)
-    with pytest.raises(ValueError, match=r"moves no inertia.*missing_inertia=jd.inertia.sphere\(1.0, 0.1\)"):
+    with pytest.raises(ValueError, match=r"missing_inertia=jd.inertia.sphere\(1.0, 0.1\)"):
         jd.load_model(path)
     ball = jd.inertia.sphere(2.0, 0.1)
     for model in (jd.load_model(path, missing_inertia=ball), jd.load(path, missing_inertia=ball).system):
@@ -777,21 +751,6 @@ def test_arms_without_inertias_load_for_kinematics(tmp_path):
     for bad in (np.nan, "1 kg"):
         with pytest.raises(ValueError, match="missing_inertia"):
             jd.load_model(path, missing_inertia=bad)
-
-
-def test_published_arms_without_inertias_load_for_kinematics(robots_dir):
-    """Romeo's fingers have none."""
-    path = robots_dir / "romeo_description/urdf/romeo.urdf"
-    model = jd.load_model(path, missing_inertia=jd.inertia.sphere(0.1, 0.02))
-    oracle = pin.buildModelFromUrdf(str(path))
-    q = np.random.default_rng(0).uniform(-1, 1, model.nq)
-    data = oracle.createData()
-    pin.framesForwardKinematics(oracle, data, q)
-    for name in ("l_wrist", "LFinger13_link", "r_ankle"):
-        if oracle.existFrame(name):
-            np.testing.assert_allclose(
-                jd.frame_pose(model, jnp.asarray(q), name), data.oMf[oracle.getFrameId(name)].homogeneous, atol=1e-12
-            )
 
 
 def test_packages_of_xacro_files_without_ros(tmp_path):
@@ -823,9 +782,9 @@ def test_packages_of_xacro_files_without_ros(tmp_path):
         jd.load_model(path)
     np.testing.assert_allclose(jd.load_model(path, packages={"elsewhere": str(tmp_path / "parts")}).inertias[0, 0], 3.0)
     assert jd.io.urdf_inertia_report(path, packages={"elsewhere": tmp_path / "parts"}) == []  # the arm's inertia is one
-    with pytest.raises(ValueError, match=r"packages\['elsewhere'\] is 'nowhere', which is no folder"):
+    with pytest.raises(ValueError, match=r"packages\['elsewhere'\] is 'nowhere'"):
         jd.load_model(path, packages={"elsewhere": "nowhere"})
     other = tmp_path / "r.urdf"
     other.write_text("<robot name='r'><link name='a'/></robot>")
-    with pytest.raises(ValueError, match=r"packages is .* is no \.xacro file"):
+    with pytest.raises(ValueError, match=r"packages .*no \.xacro"):
         jd.load_model(other, packages={"a": "b"})

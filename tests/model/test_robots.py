@@ -8,7 +8,6 @@ import pytest
 from pinocchio_bridge import ROBOT_FILES, assert_close, load_both, quick, random_states
 
 import jaxdyn as jd
-from jaxdyn.dynamics import recursions
 
 FEW = {"panda.urdf": False}
 # ur3.urdf is a xacro file without links, which Pinocchio refuses too; the links of these two have no mass, so that some of
@@ -95,25 +94,6 @@ def test_agrees_with_pinocchio(file, floating):
         computed = np.asarray(got["forward dynamics"][i])
         missed, worth = mass @ computed + want["bias"] - np.asarray(tau[i]), np.abs(mass) @ np.abs(computed)
         assert np.abs(missed).max() <= 1e-10 * np.abs(tau[i]).max() + 1e-14 * worth.max(), "residual of M a + h = tau"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("file,floating", [case for case in CASES])
-def test_recursion_agrees_with_pinocchio(file, floating):
-    model, source, bridge = load_both(file, floating)
-    if model.nv == 0:
-        pytest.skip("no joints: nothing moves")
-    q, v, a, tau, _ = random_states(model, 5, 2)
-    got = quick(jax.vmap(lambda q, v, a, tau: (recursions.rnea(model, q, v, a), recursions.aba(model, q, v, tau))))(
-        q, v, a, tau
-    )
-    data = source.createData()
-    for i, q_pin in enumerate(bridge.q_to_pinocchio(q)):
-        vi, ai, ti = (np.asarray(x[i]) for x in (v, a, tau))
-        mass = np.triu(pin.crba(source, data, q_pin))
-        spread = np.linalg.cond(mass + np.triu(mass, 1).T)
-        assert_close(got[0][i], pin.rnea(source, data, q_pin, vi, ai), 1e-10, "rnea")
-        assert_close(got[1][i], pin.aba(source, data, q_pin, vi, ti), max(1e-10, 1e-15 * spread), "aba")
 
 
 @pytest.mark.parametrize("file", REFUSED)

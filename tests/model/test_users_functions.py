@@ -40,7 +40,7 @@ def test_places_of_joints(tree):
     assert (tree.q_index("j0"), tree.v_index("j4")) == (slice(0, 7), slice(11, 14))
     q = jnp.arange(float(tree.nq))
     assert float(q[tree.q_index("j3")]) == q[tree.topology.q_slices[3]][0]
-    with pytest.raises(ValueError, match="joint 'j9' is not in model 'tree3'"):
+    with pytest.raises(ValueError, match=r"'j9' .*'tree3'"):
         tree.q_index("j9")
 
 
@@ -50,9 +50,9 @@ def test_selection_matrix_takes_the_motors(tree):
     np.testing.assert_array_equal(S.T @ v, [v[14], v[11], v[12], v[13]])
     np.testing.assert_array_equal(tree.selection_matrix(), np.eye(tree.nv)[:, 6:])  # all but the floating base
     assert tree.selection_matrix([]).shape == (tree.nv, 0)
-    with pytest.raises(ValueError, match=r"name each joint once"):
+    with pytest.raises(ValueError, match="joint once"):
         tree.selection_matrix(["j1", "j1"])
-    with pytest.raises(ValueError, match=r"give a list of names, \['j1'\]"):
+    with pytest.raises(ValueError, match=r"\['j1'\]"):
         tree.selection_matrix("j1")
 
 
@@ -83,11 +83,11 @@ def test_payload_is_a_body_welded_there():
 
 def test_payload_refuses(tree):
     bare = jd.ModelBuilder().add_body("a", inertia=random_inertia(np.random.default_rng(0))).add_frame("lab").build()
-    with pytest.raises(ValueError, match="frame 'lab' is fixed to the world"):
+    with pytest.raises(ValueError, match="'lab' is fixed"):
         bare.with_payload("lab", np.ones(10))
-    with pytest.raises(ValueError, match=r"inertia has shape \(4, 10\).*use jax.vmap"):
+    with pytest.raises(ValueError, match=r"\(4, 10\).*jax.vmap"):
         tree.with_payload("f1", np.ones((4, 10)))
-    with pytest.raises(ValueError, match=r"parts of shapes \[\(\), \(2,\), \(3, 3\)\]"):
+    with pytest.raises(ValueError, match=r"\[\(\), \(2,\), \(3, 3\)\]"):
         tree.with_payload("f1", (1.0, np.ones(2), np.eye(3)))
 
 
@@ -201,7 +201,7 @@ def test_fixed_joints_name_frames(urdf):
     assert_close(jd.frame_pose(model, q, "mount"), wanted)
     both = jd.join(model, model, prefix=("a_", "b_"))
     assert_close(jd.frame_pose(both, jnp.array([0.4, 0.1]), "a_mount"), wanted)
-    with pytest.raises(ValueError, match="joint 'mount' of model 'arm' is fixed: it has no coordinates"):
+    with pytest.raises(ValueError, match=r"'mount' .*no coordinates"):
         model.v_index("mount")
     with pytest.raises(ValueError, match="did you mean mount"):
         jd.frame_pose(model, q, "mont")
@@ -218,11 +218,11 @@ def test_load_takes_every_format(urdf, tmp_path, monkeypatch):
     assert jd.load(tmp_path / "a.xml").system.joint_names == ("shoulder",)
     with pytest.warns(jd.io.NotTakenWarning):
         assert jd.load(tmp_path / "b.xml").system.joint_names == ("j",)
-    with pytest.raises(ValueError, match=r"floating_base is True, but .* is MJCF"):
+    with pytest.raises(ValueError, match=r"floating_base .*MJCF"):
         jd.load(tmp_path / "c.mjcf", floating_base=True)
-    with pytest.raises(ValueError, match=r"x\.step: not a file of a known format"):
+    with pytest.raises(ValueError, match=r"x\.step: .*known format"):
         jd.load("x.step")
-    with pytest.raises(ValueError, match=r"gone\.xml' cannot be read \(No such file"):
+    with pytest.raises(ValueError, match=r"gone\.xml' .*No such"):
         jd.load(tmp_path / "gone.xml")
     # A name of robot_descriptions, whose module says where the file is; nothing is fetched here.
     fake = types.ModuleType("robot_descriptions.go2_description")
@@ -230,7 +230,7 @@ def test_load_takes_every_format(urdf, tmp_path, monkeypatch):
     pytest.importorskip("robot_descriptions", reason="robot_descriptions is not installed")
     monkeypatch.setitem(sys.modules, fake.__name__, fake)
     assert jd.load("go2_description").system.name == "arm"
-    with pytest.raises(ValueError, match="neither a file nor a robot of robot_descriptions; did you mean go2_desc"):
+    with pytest.raises(ValueError, match="did you mean go2_desc"):
         jd.load("go2_descriptio")
 
 
@@ -244,7 +244,7 @@ def test_one_motion_of_a_batch_is_a_log(tmp_path):
         log = jd.read_log(tmp_path / name, rollout=2)
         np.testing.assert_array_equal(log.q, motion.q[1])
         np.testing.assert_array_equal(log.tau, motion.torque[1])
-        with pytest.raises(ValueError, match="holds 2 motions; choose one, as rollout=1"):
+        with pytest.raises(ValueError, match=r"2 motions; .*rollout=1"):
             jd.read_log(tmp_path / name)
-        with pytest.raises(ValueError, match="rollout is 3; the motions of the file are 1 to 2"):
+        with pytest.raises(ValueError, match="rollout is 3"):
             jd.read_log(tmp_path / name, rollout=3)

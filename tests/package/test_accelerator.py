@@ -135,7 +135,7 @@ def test_kernels_that_run_thread_by_thread_on_a_cpu_run_on_an_accelerator(name):
 
 
 SLOW = "four-bar's gradient", "Bennett's linkage", "four-bar", "four-bar in fixed steps", "ball on an incline"
-SLOW = *SLOW, "rolling disk, minimal velocities", "rolling disk"
+SLOW = *SLOW, "rolling disk, minimal velocities", "rolling disk", "assembly", "inverse kinematics"
 
 
 @pytest.mark.long

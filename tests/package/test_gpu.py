@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from benchmarks import gpu, gpu_model
+from benchmarks import gpu
 from jaxdyn.compile.operations import cosine, sine
 
 
@@ -54,47 +54,6 @@ ENTRY %main (q: f32[4]) -> f32[4] {
 }
 """
     assert gpu.launches(text) == {"once": 1, "each turn": 3, "libraries": 1, "callbacks": 1}
-
-
-@pytest.mark.long
-def test_operations_of_a_rollout_are_those_of_all_its_evaluations():
-    computed = gpu.functions("iiwa", steps=10)
-    dynamics, rollout = computed["forward dynamics"], computed["RK4 rollout, 10 steps"]
-    one, all_steps = (
-        gpu.operations_of(jax.vmap(function), gpu.arguments("iiwa", sizes, 3), 10)
-        for function, sizes in (dynamics, rollout)
-    )
-    # Four evaluations a step, and the sums of the method.
-    assert 40 * one < all_steps < 60 * one
-
-
-@pytest.mark.long
-def test_the_benchmark_for_gpus_runs_to_its_end_without_one(capsys):
-    gpu.measure(["iiwa"], [4], steps=2, size=2**10)
-    printed = capsys.readouterr().out
-    assert "no GPU here" in printed
-    assert [line.split("|")[2].strip() for line in printed.splitlines()[-5:]] == [
-        "forward dynamics", "inverse dynamics", "gradient of forward dynamics", "RK4 rollout, 2 steps",
-        "gradient of the rollout",
-    ]  # fmt: skip
-    assert all(rate > 0 for rate in gpu.peaks(2**10))
-
-
-def test_lanes_wait_for_the_longest_sample_of_a_warp():
-    steps = np.full(64, 2)
-    assert gpu_model.waiting(steps) == 1.0
-    steps[3] = 34
-    assert gpu_model.waiting(steps) == (34 + 2) * 32 / (2 * 63 + 34)
-
-
-@pytest.mark.long
-def test_modelled_figures_have_every_function_of_a_robot():
-    rows = list(gpu_model.rows("iiwa", 4096, 10))
-    assert [x[0] for x in rows] == list(gpu.functions("iiwa", 10))
-    once, rollout = rows[0][1], rows[3][1]
-    assert gpu_model.LAUNCH < once < 1e-5
-    # Forty evaluations and two launches.
-    assert 30 * (once - gpu_model.LAUNCH) < rollout < 60 * once
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

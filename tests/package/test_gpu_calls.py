@@ -241,6 +241,7 @@ def test_donated_buffers(gpu):
     assert_same(donating(jnp.copy(q), v, tau), wanted)
 
 
+STARTING = "cuInit", "cuDriverGetVersion", "cuDeviceGetCount", "cuDeviceGet", "cuDeviceGetAttribute"
 LOADING = (
     "cuStreamGetCtx", "cuCtxPushCurrent_v2", "cuModuleLoadDataEx", "cuModuleGetFunction", "cuFuncGetAttribute",
     "cuCtxGetDevice", "cuDeviceGetAttribute", "cuCtxPopCurrent_v2", "cuLaunchKernel",
@@ -252,9 +253,7 @@ def test_errors_of_the_driver_are_errors_of_xla(gpu, name):
     factor = 20.0 + LOADING.index(name)  # a kernel that is not loaded yet
     call, x = doubled(factor), jnp.ones((3, 2))
     gpu.fails = name
-    with pytest.raises(
-        jax.errors.JaxRuntimeError, match=f"{name} of CUDA's driver failed with CUDA_ERROR_OUT_OF_MEMORY"
-    ):
+    with pytest.raises(jax.errors.JaxRuntimeError, match=f"{name} of .*CUDA_ERROR_OUT_OF_MEMORY"):
         call(x)
     gpu.fails = None
     gpu.contexts.clear()
@@ -269,7 +268,7 @@ def test_an_error_without_a_name_has_its_number(gpu, monkeypatch):
 
 def test_the_assembler_says_what_it_refuses(gpu, monkeypatch):
     monkeypatch.setattr(gpu, "refusal", b"ptxas error : line 3")
-    with pytest.raises(jax.errors.JaxRuntimeError, match=r"cuModuleLoadDataEx of .*: ptxas error : line 3"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match="ptxas error : line"):
         doubled(46.0)(jnp.ones((3, 2)))
 
 
@@ -295,11 +294,11 @@ def test_a_kernel_of_another_process_is_an_error(gpu):
     entries = {number: kernel.entry for number, kernel in device._kernels.items()}
     for entry in entries.values():
         entry.hash = 0
-    with pytest.raises(ValueError, match="compiled by another process"):
+    with pytest.raises(ValueError, match="by another process"):
         call(x)
     for number, entry in entries.items():
         entry.hash, entry.buffers = number, entry.buffers + 1
-    with pytest.raises(ValueError, match="another size than the kernel was written for"):
+    with pytest.raises(ValueError, match="another size than"):
         call(x)
     for entry in entries.values():
         entry.buffers -= 1
@@ -327,18 +326,24 @@ def test_what_takes_too_much_memory_runs_on_jax_after_a_warning(gpu, caplog):
 def test_a_build_of_llvm_without_the_target_is_unsupported(monkeypatch):
     monkeypatch.setattr(ptx, "_TRIPLE", "nvptx128-nobody-here")
     monkeypatch.setattr(ptx, "_target", ptx._target.__wrapped__)
-    with pytest.raises(jax_adapter.Unsupported, match="LLVM has no target for NVIDIA's GPUs"):
+    with pytest.raises(jax_adapter.Unsupported, match="LLVM has no target"):
         ptx.ptx_of("", 90)
 
 
 @pytest.mark.parametrize(
-    "name", ["cuInit", "cuDriverGetVersion", "cuDeviceGetCount", "cuDeviceGet", "cuDeviceGetAttribute"]
+    ("options", "fails", "message"),
+    [
+        *(({}, name, f"^{name} of CUDA's driver failed") for name in STARTING),
+        ({"version": 11080}, None, "version 11.8, and kernels need 12.0"),
+        ({"capability": (6, 1)}, None, "compute capability 6.1"),
+        ({"devices": 0}, None, "sees no device"),
+    ],
 )
-def test_a_driver_that_fails_at_its_start_is_unsupported_by_name(name, monkeypatch):
-    stand_in = gpu_stand_in.StandInDriver()
-    stand_in.fails = name
+def test_drivers_and_devices_that_do_not_serve_are_unsupported_by_name(options, fails, message, monkeypatch):
+    stand_in = gpu_stand_in.StandInDriver(**options)
+    stand_in.fails = fails
     monkeypatch.setattr(device, "open_library", lambda: stand_in)
-    with pytest.raises(jax_adapter.Unsupported, match=f"^{name} of CUDA's driver failed"):
+    with pytest.raises(jax_adapter.Unsupported, match=message):
         FIND_DRIVER()
 
 
@@ -362,24 +367,11 @@ def test_the_driver_is_found_under_its_names(monkeypatch):
     monkeypatch.setattr(device.sys, "platform", "linux")
     assert device.open_library() == "libcuda.so" and asked == ["libcuda.so.1", "libcuda.so"]
     monkeypatch.setattr(device.ctypes, "CDLL", find)
-    with pytest.raises(jax_adapter.Unsupported, match=r"CUDA's driver is not installed \(libcuda\.so\.1\)"):
+    with pytest.raises(jax_adapter.Unsupported, match=r"not installed \(libcuda\.so\.1\)"):
         device.open_library()
     monkeypatch.setattr(device.sys, "platform", "win32")
     with pytest.raises(jax_adapter.Unsupported, match=r"nvcuda\.dll"):
         device.open_library()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"version": 11080}, "version 11.8, and kernels need 12.0"),
-        ({"capability": (6, 1)}, "compute capability 6.1, and kernels need 7.0"),
-        ({"devices": 0}, "sees no device"),
-    ],
-)
-def test_old_drivers_and_devices_are_unsupported(options, message):
-    with pytest.raises(jax_adapter.Unsupported, match=message):
-        device.Driver(gpu_stand_in.StandInDriver(**options))
 
 
 def test_without_a_driver_functions_run_on_jax_after_one_warning(caplog, monkeypatch):

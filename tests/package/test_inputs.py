@@ -3,8 +3,6 @@
 # pyright: reportArgumentType=false
 
 import pickle
-import subprocess
-import sys
 import traceback
 
 import diffrax
@@ -146,7 +144,7 @@ def test_numbers_of_any_kind_give_those_of_the_model(system, function, args):
 def test_what_does_not_fit_is_refused_with_its_name(system, function, args):
     for i in range(len(args)):
         for wrong in (jnp.asarray(args[i], complex), "abc"):
-            with pytest.raises(ValueError, match=r"is complex|pass an array of numbers|pass one"):
+            with pytest.raises(ValueError, match=r"is complex|array of numbers|pass one"):
                 function(system, *args[:i], wrong, *args[i + 1 :])
     if function is not OF_BODIES["regressor"][0]:
         with pytest.raises(ValueError, match=r"has shape \(2, .*vmap"):
@@ -155,13 +153,13 @@ def test_what_does_not_fit_is_refused_with_its_name(system, function, args):
 
 @pytest.mark.parametrize(("name", "call"), (OF_BODIES | OF_SYSTEMS).items())
 def test_functions_of_a_system_say_what_to_pass_for_a_scene(name, call):
-    with pytest.raises(ValueError, match=r"is a Scene; pass scene\.system"):
+    with pytest.raises(ValueError, match=r"pass scene\.system"):
         call[0](CHAIN, *call[1:])
 
 
 @pytest.mark.parametrize(("name", "call"), OF_BODIES.items())
 def test_functions_of_bodies_refuse_other_systems(name, call):
-    with pytest.raises(ValueError, match="MetricSystem, which has no bodies"):
+    with pytest.raises(ValueError, match="has no bodies"):
         call[0](PLANE, *call[1:])
 
 
@@ -171,26 +169,8 @@ def test_functions_of_a_scene_take_a_system_as_one(name, call):
     if name in ("constrained_dynamics", "simulate", "stiffness"):
         same(call[0](ARM, *call[1:]), call[0](jd.Scene(ARM), *call[1:]))
     else:
-        with pytest.raises(ValueError, match=r"the scene has no constraints"):
+        with pytest.raises(ValueError, match="has no constraints"):
             call[0](ARM, *call[1:])
-
-
-def test_a_scene_is_no_system_of_another():
-    with pytest.raises(ValueError, match=r"system is a Scene; pass scene\.system"):
-        jd.Scene(CHAIN)
-    with pytest.raises(ValueError, match="system is a str"):
-        jd.Scene("arm")
-
-
-def test_a_batch_without_vmap_is_told_so():
-    with pytest.raises(ValueError, match=r"control returned shape \(4, 2\), expected \(2,\).*jax\.vmap"):
-        jd.simulate(ARM, [0, 0], [0, 0], [0, 1], control=lambda q, v, t: jnp.ones((4, 2)))
-    with pytest.raises(ValueError, match=r"nu has shape \(4, 1\).*jax\.vmap"):
-        jd.reduced_dynamics(CHAIN, Q, jnp.ones((4, 1)), basis=(0,))
-    with pytest.raises(ValueError, match=r"multipliers has shape \(4, 1\).*jax\.vmap"):
-        jd.constraint_forces(CHAIN, Q, jnp.ones((4, 1)))
-    with pytest.raises(ValueError, match=r"stepsize has shape \(2,\).*jax\.vmap"):
-        jd.simulate(ARM, [0, 0], [0, 0], [0, 1], stepsize=[0.1, 0.2])
 
 
 def stiffer(q, v, t):
@@ -206,23 +186,16 @@ OPTIONS = [
     ({"stepsize": "0.1"}, "stepsize is .*; pass an array of numbers"),
     ({"stepsize": -0.1}, "stepsize is -0.1; pass a positive number"),
     ({"stepsize": jd.simulation.Steps(0.1, rtol=1e-6)}, "rtol is given, and RK4 has no use for it with fixed steps"),
-    (
-        {"stepsize": jd.simulation.Steps(0.1, atol=1e-6), "solver": diffrax.Tsit5()},
-        "atol is given, and Tsit5 has no use",
-    ),
-    (
-        {"stepsize": jd.simulation.Steps(diffrax.StepTo(jnp.linspace(0, 1, 5)), rtol=1e-6)},
-        "rtol is given, and Dopri8 .* their own steps",
-    ),
-    (
-        {"events": [jd.events.ModeSwitches(8)]},
-        r"events has ModeSwitches\(max_events=8\), and no force of the scene has events",
-    ),
+    ({"stepsize": jd.simulation.Steps(0.1, atol=1e-6), "solver": diffrax.Tsit5()}, "atol .*Tsit5 has no use"),
+    ({"stepsize": jd.simulation.Steps(diffrax.StepTo(jnp.linspace(0, 1, 5)), rtol=1e-6)}, "rtol .*their own steps"),
+    ({"events": [jd.events.ModeSwitches(8)]}, "ModeSwitches.*no force of"),
     ({"events": jd.events.JointLimit()}, "events is JointLimit.*; pass a list"),
     ({"events": ["stop"]}, "events has 'stop'; give objects of jd.events"),
     ({"events": [jd.events.ContactLost()]}, "ContactLost.*, and the scene has no cones"),
     ({"control": lambda q, v, t: np.sin(q)}, "control needs the values .* jax.numpy"),
     ({"control": stiffer}, r"control needs the values .* jax\.lax\.cond instead of if"),
+    ({"control": lambda q, v, t: jnp.ones((4, 2))}, r"shape \(4, 2\).*jax\.vmap"),
+    ({"stepsize": [0.1, 0.2]}, r"stepsize .*jax\.vmap"),
     ({"control": lambda q, v: q}, r"control takes \(q, v\), but is called as control\(q, v, t\)"),
 ]
 
@@ -247,24 +220,19 @@ def test_a_model_without_moving_bodies():
     energies, (mass, matrix), acceleration, centre, momentum = compute()
     assert energies == (0, 0) and mass.shape == (0, 0) and matrix.shape == (6, 0)
     assert acceleration.shape == (0,) and np.isnan(centre).all() and not momentum.any()
-    with pytest.raises(ValueError, match=r"no coordinates \(nq = nv = 0\), so nothing moves"):
+    with pytest.raises(ValueError, match="so nothing moves"):
         jd.simulate(empty, none, none, [0.0, 1.0])
-
-
-def test_forces_that_do_not_fit_are_named():
-    with pytest.raises(ValueError, match=r"forces\[0\] takes \(q, v, t\), but is called as force\(system, q, v, t\)"):
-        jd.simulate(jd.Scene(ARM, forces=(stiffer,)), [0, 0], [0, 0], [0, 1], stepsize=0.1)
 
 
 def test_paths(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     for load in (jd.load_model, jd.load):
-        with pytest.raises(ValueError, match=r"(path|source) is None; pass the path of a file"):
+        with pytest.raises(ValueError, match=r"(path|source) is None"):
             load(None)
     jd.save_urdf(ARM, "~/arm.urdf")
     assert (tmp_path / "arm.urdf").exists()
     assert jd.load_model("~/arm.urdf").joint_names == ARM.joint_names
-    with pytest.raises(ValueError, match=r"--out nowhere/a\.csv: there is no directory nowhere"):
+    with pytest.raises(ValueError, match=r"--out .* directory nowhere"):
         output_path("nowhere/a.csv", (".csv",), "--out")
 
 
@@ -403,7 +371,7 @@ def test_motions_start_from_unit_quaternions(modes):
     scene = jd.Scene(model, forces=(jd.contact.DryFriction(0.3, normal=1.0, along=0),) if modes else ())
     starts = jnp.asarray([[1.0, 0, 0, 0], [2.0, 0, 0, 0], [1.0002, 0, 0, 0], [0.0, 0, 0, 0], [jnp.nan, 0, 0, 0]])
     v0, options = jnp.asarray([1.0, 0.2, 0.1]), {"throw": False} | ({} if modes else {"stepsize": 0.05})
-    with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1"):
+    with pytest.raises(ValueError, match=r"length 2 .*'ball_joint'"):
         jd.simulate(scene, starts[1], v0, [0.0, 0.1], **options)
     run = jax.jit(jax.vmap(lambda q: jd.simulate(scene, q, v0, [0.0, 0.1], **options)))
     computed = run(starts)
@@ -431,6 +399,16 @@ def test_codes_of_a_batch_print_as_words():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (lambda: jd.Scene(CHAIN), r"pass scene\.system"),
+        (lambda: jd.Scene("arm"), "system is a str"),
+        # Batches without vmap.
+        (lambda: jd.reduced_dynamics(CHAIN, Q, jnp.ones((4, 1)), basis=(0,)), r"nu .*jax\.vmap"),
+        (lambda: jd.constraint_forces(CHAIN, Q, jnp.ones((4, 1))), r"multipliers .*jax\.vmap"),
+        # Functions of other arguments.
+        (
+            lambda: jd.simulate(jd.Scene(ARM, forces=(stiffer,)), [0, 0], [0, 0], [0, 1], stepsize=0.1),
+            r"forces\[0\] takes",
+        ),
         (lambda: jd.Holonomic(lambda q: q), r"phi takes \(q\), but is called as \(q, t\)"),
         (lambda: jd.Holonomic(lambda q, t: q, with_system=True), r"called as \(system, q, t\)"),
         (lambda: jd.Pfaffian(lambda q: q), r"A takes \(q\), but is called as \(q, t\)"),
@@ -445,7 +423,7 @@ def test_codes_of_a_batch_print_as_words():
         (lambda: hybrid(lambda q: q, force=lambda: 0), r"force takes \(\), but is called as \(t\)"),
     ],
 )
-def test_functions_of_other_arguments_are_refused_when_they_are_given(make, words):
+def test_what_does_not_fit_is_refused_when_it_is_given(make, words):
     with pytest.raises(ValueError, match=words):
         make()
 
@@ -510,17 +488,13 @@ def test_an_error_inside_a_traced_law_is_told_in_few_lines(way):
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("error")
 def test_scenes_are_built_without_a_warning():
     """In single precision, as a new process has it; Allegro's file alone holds inertias of no body."""
-    code = """
-import warnings
-import jaxdyn as jd
-for name in jd.scenes.names():
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        scene = getattr(jd.scenes, name)
-        scene(), scene.start()
-    assert not said or name == "allegro_with_cube", (name, said[0])
-"""
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    assert run.returncode == 0, run.stderr[-1000:]
+    with jax.enable_x64(False):
+        for name in sorted(set(jd.scenes.names()) - {"allegro_with_cube"}):
+            scene = getattr(jd.scenes, name)
+            scene()
+            # The starts of these take seconds to assemble, and other tests have them.
+            if name not in ("coordinated_lifting", "sphere_arm"):
+                scene.start()

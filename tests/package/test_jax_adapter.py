@@ -1,13 +1,9 @@
 """JAX of several versions, those of the future included: what jaxdyn uses of it, and what it does where that has changed."""
 
-import ast
 import functools
 import importlib.util
 import logging
-import pkgutil
 import re
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,76 +21,6 @@ from jaxdyn.compile import expansion, jax_adapter, kernels, mode, target
 from jaxdyn.compile.executables import run_trial
 
 ADAPTER = Path(jax_adapter.__file__)
-
-
-def names_of_jax(tree: ast.Module) -> set[str]:
-    """Dotted names of JAX in a module: what it imports and the attributes of that."""
-    local, names = {}, set()
-    for node in ast.walk(tree):
-        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
-            name = f"{node.module}.{alias.name}" if isinstance(node, ast.ImportFrom) else alias.name
-            names.add(name)
-            whole = alias.asname or isinstance(node, ast.ImportFrom)
-            local[alias.asname or alias.name.partition(".")[0]] = name if whole else name.partition(".")[0]
-    inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and node not in inner:
-            head, _, rest = ast.unparse(node).partition(".")
-            names |= {f"{local[head]}.{rest}"} if head in local else set()
-    return {name for name in names if name.startswith(("jax.", "jaxlib"))}
-
-
-# --- names ---
-
-# Names of JAX that the adapter uses, by the page below https://docs.jax.dev/en/latest/ that documents them.
-DOCUMENTED = {
-    "changelog.html": "jax.__version__",
-    "config_options.html": "jax.config",
-    "jax-primitives.html": """
-        jax.core.ShapedArray jax.interpreters.ad jax.interpreters.ad.Zero
-        jax.interpreters.ad.is_undefined_primal jax.interpreters.ad.primitive_jvps
-        jax.interpreters.ad.primitive_transposes jax.interpreters.batching
-        jax.interpreters.batching.primitive_batchers jax.interpreters.mlir
-        jax.interpreters.mlir.register_lowering""",
-    "key-concepts.html": "jax.core.Tracer",
-    "jaxpr.html": "jax.core.eval_jaxpr",
-    "_autosummary/jax.devices.html": "jax.devices",
-    "_autosummary/jax.dtypes.float0.html": "jax.dtypes.float0",
-    "errors.html": "jax.errors.JaxRuntimeError",
-    "jax.experimental.serialize_executable.html": """
-        jax.experimental.serialize_executable jax.experimental.serialize_executable.deserialize_and_load
-        jax.experimental.serialize_executable.serialize""",
-    "jax.extend.core.html": "jax.extend.core.ClosedJaxpr jax.extend.core.Literal jax.extend.core.Primitive",
-    "jax.extend.mlir.html": "jax.extend.mlir.dialects.sdy",
-    "jax.ffi.html": "jax.ffi.ffi_lowering jax.ffi.pycapsule jax.ffi.register_ffi_target",
-    "ffi.html": "jax.ffi.include_dir",
-    "_autosummary/jax.jit.html": "jax.jit",
-    "jax.lax.html": "jax.lax",
-    "_autosummary/jax.lax.pcast.html": "jax.lax.pcast",
-    "jax.sharding.html": """
-        jax.sharding.AxisType jax.sharding.AxisType.Manual jax.sharding.NamedSharding
-        jax.sharding.PartitionSpec""",
-    "_autosummary/jax.typeof.html": "jax.typeof",
-}
-# Those that no page documents, with the reason to use them.
-UNDOCUMENTED = {
-    "jax.__version_info__": "numbers of __version__; equinox and flax read it too",
-    "jax.config.values": "all options; those in force are read as attributes, as the page says",
-    "jax.extend.mlir.dialects.sdy.DimMappingAttr.get": "Shardy's own Python bindings: openxla.org/shardy",
-    "jax.extend.mlir.dialects.sdy.OpShardingRuleAttr.get": "Shardy's own Python bindings: openxla.org/shardy",
-    "jax.extend.mlir.dialects.sdy.TensorMappingAttr.get": "Shardy's own Python bindings: openxla.org/shardy",
-    "jax.ffi.register_ffi_target_as_batch_partitionable": "its docstring: without it XLA gathers the batch around a call",
-    "jax.interpreters.mlir.ir_attribute": "attributes of a call; jax.ffi has no other way to hand over one of ours",
-    "jax.interpreters.mlir.lower_fun": "lowers by operations of JAX; in all extension libraries",
-}
-
-
-def test_each_name_that_the_adapter_uses_is_listed_with_its_documentation():
-    listed = {*" ".join(DOCUMENTED.values()).split(), *UNDOCUMENTED}
-    used = names_of_jax(ast.parse(ADAPTER.read_text(encoding="utf-8")))
-    assert used == listed, f"not listed: {used - listed}; not used: {listed - used}"
-    for name in listed:
-        pkgutil.resolve_name(name)
 
 
 # --- XLA's foreign function interface ---
@@ -131,10 +57,7 @@ def test_every_minor_version_serves_while_fields_keep_their_places(minor):
         ((r"(struct XLA_FFI_CallFrame \{)", r"\1 void* first;"), "another XLA_FFI_CallFrame: {'first': 0"),
         ((r"(struct XLA_FFI_Buffer \{[^}]*)(int64_t rank;)", r"\1 int64_t layout; \2"), "another XLA_FFI_Buffer"),
         ((r"(struct XLA_FFI_Attrs \{)", r"\1 Unknown first;"), "another XLA_FFI_CallFrame"),
-        (
-            (r"(struct XLA_FFI_Error_Create_Args \{[^}]*)\}", r"\1 int64_t place; }"),
-            "another XLA_FFI_Error_Create_Args",
-        ),
+        ((r"(struct XLA_FFI_Error_Create_Args \{[^}]*)\}", r"\1 int64_t place; }"), "XLA_FFI_Error_Create_Args"),
         ((r"(_XLA_FFI_API_STRUCT_FIELD\(XLA_FFI_Stream_Get\);)", r"\1 void* more;"), "another XLA_FFI_Api"),
         ((r"struct XLA_FFI_Args \{", "struct XLA_FFI_Operands {"), "another XLA_FFI_CallFrame"),
         ((r"XLA_FFI_API_MAJOR", "XLA_FFI_OTHER"), r"version -1\."),
@@ -182,9 +105,7 @@ def future(monkeypatch) -> None:
 
 
 def one_warning(reason: str):
-    return pytest.warns(
-        UserWarning, match=rf"tested with jax 0\.10 to 0\.12, and this is jax 0\.99\.0.*{reason}.*'jax<0\.13'"
-    )
+    return pytest.warns(UserWarning, match=rf"this is jax 0\.99\.0.*{reason}.*'jax<0\.13'")
 
 
 def sums(known, x):
@@ -309,7 +230,7 @@ def test_another_interface_of_xla_leaves_everything_to_jax(future, monkeypatch, 
     assert_right(function, X, computed)
 
 
-@pytest.mark.parametrize(("module", "name"), [("ad", "Zero"), ("ad", "is_undefined_primal"), ("mlir", "ir_attribute")])
+@pytest.mark.parametrize(("module", "name"), [("ad", "Zero"), ("mlir", "ir_attribute")])
 def test_a_missing_name_leaves_everything_or_nothing_to_jax(future, monkeypatch, module, name):
     """Rules and lowerings that JAX calls meet it."""
     names = {key: value for key, value in vars(getattr(jax_adapter, module)).items() if key != name}
@@ -356,34 +277,3 @@ def test_the_adapter_can_be_imported_where_a_name_is_missing(future, monkeypatch
     monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))
     with pytest.raises(ImportError, match=name):
         spec.loader.exec_module(importlib.util.module_from_spec(spec))
-
-
-@pytest.mark.slow
-def test_the_package_works_where_a_name_is_missing():
-    code = """
-import warnings, jax, numpy as np
-jax.config.update("jax_enable_x64", True)
-import diffrax, equinox, lineax, optimistix, jax.interpreters.batching
-jax.__version__, jax.__version_info__ = "0.99.0", (0, 99, 0)
-del jax.interpreters.batching.primitive_batchers
-with warnings.catch_warnings(record=True) as caught:
-    warnings.simplefilter("always")
-    import jaxdyn as jd
-    model = jd.robots.iiwa()
-    q = np.full((3, 7), 0.3)
-    a = jax.vmap(lambda q: jd.forward_dynamics(model, q, q, q))(q)
-    slope = jax.grad(lambda q: jd.forward_dynamics(model, q, q, q).sum())(q[0])
-    motion = jd.simulate(jd.scenes.four_bar(), *jd.scenes.four_bar.start(), np.linspace(0.0, 0.2, 3))
-print(len([x for x in caught if "0.99.0" in str(x.message)]), a[0, 0], slope[0], motion.q[-1, 0])
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr[-2000:]
-    count, *numbers = map(float, done.stdout.split())
-    model, q = jd.robots.iiwa(), jnp.full(7, 0.3)
-    dynamics = lambda q: jd.forward_dynamics(model, q, q, q)  # noqa: E731
-    motion = jd.simulate(jd.scenes.four_bar(), *jd.scenes.four_bar.start(), jnp.linspace(0.0, 0.2, 3))
-    wanted = dynamics(q)[0], jax.grad(lambda q: dynamics(q).sum())(q)[0], motion.q[-1, 0]
-    assert count == 1
-    np.testing.assert_allclose(
-        numbers, np.asarray(wanted), rtol=1e-6
-    )  # of the motion; the printed digits of float64 else

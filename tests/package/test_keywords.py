@@ -37,7 +37,6 @@ BEAD = jd.geometry.constrain_by_immersion(
 )
 G3 = jnp.asarray(np.random.default_rng(0).normal(size=(6, 9)))
 TWO = jd.robots.chain(2)
-WEIGHTS = {"weights": jnp.ones(9)}
 
 
 def args(*args, **given):

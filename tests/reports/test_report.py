@@ -255,20 +255,11 @@ def counting():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "solver"),
-    [
-        pytest.param("pendulum", "Tsit5", marks=pytest.mark.slow),
-        ("pendulum_in_plane", "Tsit5"),
-        pytest.param("pendulum", "Dopri8", marks=pytest.mark.slow),
-        pytest.param("pendulum_in_plane", "Dopri8", marks=pytest.mark.slow),
-        ("pendulum", "RK4"),
-    ],
-)
+@pytest.mark.parametrize(("name", "solver"), [("pendulum_in_plane", "Tsit5"), ("pendulum", "RK4")])
 def test_evaluations_are_those_that_are_made(name, solver):
     scene, (force, calls) = getattr(jd.scenes, name), counting()
     counted = jd.Scene(scene().system, scene().constraints, (force,))
-    method = {"Tsit5": diffrax.Tsit5, "Dopri8": diffrax.Dopri8, "RK4": jd.solvers.RK4}[solver]()
+    method = {"Tsit5": diffrax.Tsit5, "RK4": jd.solvers.RK4}[solver]()
     steps = 0.05 if solver == "RK4" else jd.simulation.Steps(rtol=1e-6, atol=1e-6)
     solution = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, stepsize=steps)
     jax.effects_barrier()
@@ -431,14 +422,9 @@ def test_report_writes(small, body, rungs, tmp_path):
     assert "src=" not in page
     assert "<link" not in page
     assert 'href="http' not in page
-    for words in (
-        "Free rigid body",
-        "time per trajectory",
-        "energy error",
-        "free, Tsit5",
-        measured.head["machine"]["device"],
-    ):
+    for words in ("Free rigid body", "time per trajectory", "energy error", "free, Tsit5"):
         assert words in page
+    assert measured.head["machine"]["device"] in page
 
     peer = Contestant(
         "peer", "by hand", "exact", 1.0, True, lambda: None, lambda _: Motion(body.reference.q, body.reference.v)
@@ -464,7 +450,7 @@ def test_empty_arguments_are_refused(name):
 
 
 def test_scenes_that_cannot_be_compared_are_refused():
-    with pytest.raises(ValueError, match="'sliding_block', whose steps end at events"):
+    with pytest.raises(ValueError, match="'sliding_block', whose steps"):
         jd.report("sliding_block")
     with pytest.raises(ValueError, match="free_body, free_body"):
         jd.report([cases()["free_body"], "free_body"])
@@ -495,7 +481,7 @@ def test_a_scene_of_ones_own(rungs, monkeypatch):
 
 def test_a_page_without_matplotlib_is_refused_before_the_runs(small, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ImportError, match="jaxdyn\\[plot\\]"):
+    with pytest.raises(ImportError, match=r"jaxdyn\[plot\]"):
         jd.report("free_body", rounds=1, out=tmp_path)
     assert small == []
 

@@ -157,11 +157,7 @@ def test_a_member_is_found_again(tmp_path):
     np.testing.assert_array_equal(table.y[:, 0], table.parameter_x**2)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"chunk": 7}, {"batch_size": 2}, {"devices": 1}, {"chunk": None}],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [{"chunk": 7}, {"batch_size": 2}, {"devices": 1}, {"chunk": None}], ids=str)
 def test_rows_do_not_depend_on_how_they_are_computed(tmp_path, options):
     want = arrays(evaluated(tmp_path / "a.zarr").out)
     if "devices" in options:
@@ -203,23 +199,29 @@ def test_a_program_has_no_communication(pendulums):
 
 # Interruptions
 
+# Also on the workers of a scheduler, whose address is the second argument.
 SLOW = """
-import sys, time
+import sys
 import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 2)
-import jax.numpy as jnp
 import jaxdyn as jd
 
-def drawn(key):
+def draw(key):
     return jax.random.uniform(key, (), minval=0.1, maxval=0.9)
 
 def logistic(x):
     return {"x": jax.lax.fori_loop(0, 300_000, lambda _, x: 3.9 * x * (1 - x), x)}
 
-found = jd.scale.evaluate(logistic, drawn, samples=160, out=sys.argv[1], reductions={"x": jd.scale.Mean("x")},
-                          resources=jd.scale.Resources(batch_size=4, chunk=4, progress=False))
-print(found.computed)
+if __name__ == "__main__":
+    client = None
+    if len(sys.argv) > 2:
+        from distributed import Client
+        client = Client(sys.argv[2])
+    reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
+    resources = jd.scale.Resources(client, batch_size=4, chunk=4, progress=False)
+    run = jd.scale.evaluate(logistic, draw, samples=240, out=sys.argv[1], reductions=reductions, resources=resources)
+    print(run.computed)
 """
 
 
@@ -228,12 +230,6 @@ def started(code, *args, **environment):
     env = os.environ | {"PYTHONPATH": str(Path(jd.__file__).parents[1]), "JAX_PLATFORMS": "cpu"} | environment
     command = [sys.executable, "-c", textwrap.dedent(code), *map(str, args)]
     return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def ended(process, timeout=400.0):
-    out, error = process.communicate(timeout=timeout)
-    assert process.returncode == 0, error[-3000:]
-    return out
 
 
 def recorded(path):
@@ -260,11 +256,11 @@ def test_kill_9_and_resume(tmp_path):
     process = started(SLOW, out)
     killed_at([process], out, 3, [0])
     kept = recorded(out)
-    assert 3 <= kept < 40
+    assert 3 <= kept < 60
     assert f"process {process.pid} of" in (tmp_path / "killed.zarr.owner").read_text()
     before = {name: data for name, data in files(out).items() if name.startswith("result")}
     resumed = slow_here(out)  # the lock of a dead process is free
-    assert resumed.computed == 160 - 4 * kept
+    assert resumed.computed == 240 - 4 * kept
     assert before.items() <= files(out).items()
     whole = slow_here(tmp_path / "whole.zarr")
     assert files(out) == files(whole.out)
@@ -274,10 +270,11 @@ def test_kill_9_and_resume(tmp_path):
 
 def slow_here(out):
     """What `SLOW` computes, in this process."""
-    source: dict = {}
-    exec(SLOW.split("found =")[0].replace("jax.config.update(", "(lambda *_: None)("), source)
-    options = {"samples": 160, "batch_size": 4, "chunk": 4, "reductions": {"x": jd.scale.Mean("x")}}
-    return evaluated(out, function=source["logistic"], parameters=source["drawn"], **options)
+    source: dict = {"__name__": "slow"}
+    exec(SLOW.replace("jax.config.update(", "(lambda *_: None)("), source)
+    reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
+    options = {"samples": 240, "batch_size": 4, "chunk": 4, "reductions": reductions}
+    return evaluated(out, function=source["logistic"], parameters=source["draw"], **options)
 
 
 # Stores that are not what they should be
@@ -287,7 +284,7 @@ def test_the_second_run_on_a_store_is_refused(tmp_path):
     out = tmp_path / "a.zarr"
     evaluated(out)
     with lock_store(out):
-        with pytest.raises(ValueError, match=rf"process {os.getpid()} of .* on .*, since .*, is writing.*wait for it"):
+        with pytest.raises(ValueError, match=f"process {os.getpid()} of .* is writing"):
             evaluated(out)
     assert evaluated(out).computed == 0
 
@@ -342,7 +339,7 @@ def test_a_store_of_something_else_is_refused_with_what_differs(tmp_path, monkey
     (out / "zarr.json").write_text(json.dumps(old))
     refused("whose format is 0 of jaxdyn and not 3")
     (tmp_path / "c.zarr").mkdir()
-    with pytest.raises(ValueError, match=r"no store of jd\.scale"):
+    with pytest.raises(ValueError, match="no store of"):
         evaluated(tmp_path / "c.zarr")
 
 
@@ -359,45 +356,26 @@ def test_a_store_of_another_scene_or_other_times_is_refused(pendulums, tmp_path)
             jd.scale.run(scene, (starts, np.zeros(2)), {"damping": damping}, times, **options)
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=768k", "tmpfs", folder], capture_output=True)
-    if mounted.returncode:
-        pytest.skip("no file system can be mounted here")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
 def heavy(p):
     return {"y": jnp.full(2000, p["x"])}
 
 
-def test_a_full_disk_loses_nothing(small_disk, tmp_path):
-    """16 kB a rollout on a disk of 768 kB: it ends with an error that says so, and goes on elsewhere where there is room."""
-    out = small_disk / "a.zarr"
-    with pytest.raises(OSError, match=r"its file system is full .*chunks that were finished are kept") as caught:
-        evaluated(out, function=heavy, samples=80, chunk=4)
-    assert caught.value.errno == errno.ENOSPC
-    kept = recorded(out)
-    assert kept > 3 and not list(small_disk.rglob("*.partial"))
-    shutil.copytree(out, tmp_path / "roomy.zarr")
-    resumed = evaluated(tmp_path / "roomy.zarr", function=heavy, samples=80, chunk=4)
-    assert resumed.computed == 80 - 4 * kept and resumed.repaired == ()
-    whole = evaluated(tmp_path / "whole.zarr", function=heavy, samples=80, chunk=4)
-    assert files(resumed.out) == files(whole.out)
+def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
+    """The run ends with an error that says so, and goes on where there is room again."""
+    out, write = tmp_path / "a.zarr", stores.Store.write
 
-
-def test_a_full_disk_is_told_wherever_it_is_met(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def full(store, chunk, arrays):
+        if chunk > 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(store, chunk, arrays)
 
     monkeypatch.setattr(stores.Store, "write", full)
-    with pytest.raises(OSError, match=r"a\.zarr', and its file system is full"):
-        evaluated(tmp_path / "a.zarr")
+    with pytest.raises(OSError, match=r"full .*finished are kept") as caught:
+        evaluated(out)
+    assert caught.value.errno == errno.ENOSPC and recorded(out) == 3
     monkeypatch.undo()
-    assert evaluated(tmp_path / "a.zarr").computed == 23
+    assert evaluated(out).computed == 23 - 3 * 5
+    assert files(out) == files(evaluated(tmp_path / "whole.zarr").out)
 
 
 # Failures and reductions
@@ -547,6 +525,8 @@ def test_quantiles_outside_of_the_bins_are_not_made_up():
 
 
 def test_blocks_fit_the_memory(tmp_path, monkeypatch):
+    assert 2**20 < program.available_memory(jax.local_devices()) < 2**50
+
     def run(name):
         return evaluated(tmp_path / name, function=heavy, samples=400, chunk=400, batch_size=400)
 
@@ -557,13 +537,9 @@ def test_blocks_fit_the_memory(tmp_path, monkeypatch):
     assert tight.batch_size < 30 and tight.program_bytes <= 2**20
     assert_equal(arrays(free.out), arrays(tight.out))
     monkeypatch.setattr("jaxdyn.scale.study.available_memory", lambda _: 2000)
-    with pytest.raises(MemoryError, match=r"a program of 2 rollouts needs .* MiB, and .* are allowed"):
+    with pytest.raises(MemoryError, match=r"2 rollouts needs .*allowed"):
         run("c.zarr")
     assert not (tmp_path / "c.zarr").exists()
-
-
-def test_free_memory_is_that_of_the_system():
-    assert 2**20 < program.available_memory(jax.local_devices()) < 2**50
 
 
 # Bad input
@@ -573,10 +549,7 @@ def test_free_memory_is_that_of_the_system():
     ("options", "error"),
     [
         ({"samples": None}, "samples is None; say how many"),
-        (
-            {"parameters": {"x": np.ones(3), "w": np.ones(4)}, "samples": None},
-            r"parameters\['w'\] is of 4 .*'x'\] of 3|of 3",
-        ),
+        ({"parameters": {"x": np.ones(3), "w": np.ones(4)}, "samples": None}, r"parameters\['w'\] is of 4"),
         ({"parameters": {"x": np.ones(3)}, "samples": 5}, "is of 3 rollouts and samples of 5"),
         ({"parameters": {"x": 1.0}, "samples": 5}, "is one number"),
         ({"seed": -1}, "seed is -1"),
@@ -616,7 +589,7 @@ def test_reductions_and_states_refuse(tmp_path):
 
 def test_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(ImportError, match=r"jd.scale needs zarr: pip install 'jaxdyn\[scale\]'"):
+    with pytest.raises(ImportError, match=r"zarr: .*jaxdyn\[scale\]"):
         evaluated(tmp_path / "a.zarr")
 
 
@@ -798,84 +771,42 @@ def test_stores_that_cannot_be_are_refused_with_the_cause(tmp_path, monkeypatch)
     text = place.read_text()
     for content in (text[:60], "", "[]", "null", "\x00", text.replace('"rollouts"', '"x"')):
         place.write_text(content)
-        with pytest.raises(
-            ValueError, match=f"out is '{out}', whose zarr.json is damaged .*name another store|format is"
-        ):
+        with pytest.raises(ValueError, match=r"zarr.json is damaged|format is"):
             jd.scale.evaluate(square, parameters, out=out, **QUIET)
     place.write_text(text)
     with monkeypatch.context() as patched:  # root may write anywhere
         patched.setattr(os, "access", lambda *_: False)
-        with pytest.raises(ValueError, match=f"{out} cannot be written; change its permissions"):
+        with pytest.raises(ValueError, match=f"{out} cannot be written"):
             jd.scale.evaluate(square, parameters, out=out, **QUIET)
-        with pytest.raises(ValueError, match=f"{tmp_path} cannot be written; change its permissions"):
+        with pytest.raises(ValueError, match=f"{tmp_path} cannot be written"):
             jd.scale.evaluate(square, parameters, out=tmp_path / "b.zarr", **QUIET)
     assert jd.scale.evaluate(square, parameters, out=out, **QUIET).success
 
 
-@pytest.mark.long
-def test_keywords_of_evaluate_and_run(tmp_path):
-    """Members by their seed, chosen rows, units, reductions against NumPy, one more attempt for what raises, and the meter."""
-    keys = [jax.random.fold_in(jax.random.key(7), i) for i in range(6)]
-    x = np.array([drawn(key)["x"] for key in keys])
-    run = jd.scale.evaluate(
-        square,
-        drawn,
-        samples=6,
-        out=tmp_path / "a.zarr",
-        seed=7,
-        rows=["z", "parameter_x"],
-        units={"z": "1/m", "x": "m"},
-        reductions={"mean": jd.scale.Mean("z")},
-        resources=jd.scale.Resources(batch_size=2, progress=False),
-    )
+def test_former_keywords_of_evaluate(tmp_path):
+    run = evaluated(tmp_path / "a.zarr", rows=["z"], units={"z": "1/m"})
     table = run.dataset()
-    np.testing.assert_allclose(table["z"], 1 / x, rtol=1e-14)
-    np.testing.assert_allclose(table["parameter_x"], x, rtol=0)
-    assert "y" not in table and table["z"].attrs["units"] == "1/m" and table["parameter_x"].attrs["units"] == "m"
-    np.testing.assert_allclose(run.reductions["mean"]["mean"], np.mean(1 / x), rtol=1e-14)
-    assert run.batch_size == 2
-    options = {"samples": 6, "seed": 7, "rows": ["z", "parameter_x"], "reductions": {"mean": jd.scale.Mean("z")}}
-    with pytest.warns(DeprecationWarning, match="chunk, progress of jd.scale are now fields"):
-        again = jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", chunk=3, progress=False, **options)
+    assert "y" not in table and table["z"].attrs["units"] == "1/m"
+    options = {"samples": 23, "out": run.out, "rows": ["z"], "units": {"z": "1/m"}}
+    with pytest.warns(DeprecationWarning, match=r"chunk, progress .*fields"):
+        again = jd.scale.evaluate(square, drawn, chunk=5, progress=False, **options)
     assert again.computed == 0
     with pytest.raises(TypeError, match="no argument lanes"):
-        jd.scale.evaluate(square, drawn, out=tmp_path / "a.zarr", lanes=3, **options)
+        jd.scale.evaluate(square, drawn, lanes=3, **options)
 
 
 @pytest.mark.long
-def test_seed_rows_retries_and_progress_of_runs(tmp_path, capsys, monkeypatch):
-    """Starts drawn by a seed move freely in a straight line; a chunk that raises once is computed at the second attempt."""
+def test_seed_rows_and_progress_of_runs(tmp_path, capsys):
+    """Starts drawn by a seed move freely in a straight line."""
     model = jd.ModelBuilder("free", gravity=None)
     model.add_body("a", None, "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(1, 0, 0))
-
-    def simulated(name, retries=2, progress=False):
-        return jd.scale.run(
-            model.build(), lambda p: (jnp.zeros(1), p["v"][None]), lambda key: {"v": jax.random.normal(key, ())},
-            np.array([0.0, 2.0]), samples=4, out=tmp_path / name, seed=3, rows=["q"],
-            resources=jd.scale.Resources(retries=retries, progress=progress),
-        )  # fmt: skip
-
-    run = simulated("a.zarr", progress=True)
+    run = jd.scale.run(
+        model.build(), lambda p: (jnp.zeros(1), p["v"][None]), lambda key: {"v": jax.random.normal(key, ())},
+        np.array([0.0, 2.0]), samples=4, out=tmp_path / "a.zarr", seed=3, rows=["q"],
+        resources=jd.scale.Resources(progress=True),
+    )  # fmt: skip
     assert "4" in capsys.readouterr().err
     v = np.array([jax.random.normal(jax.random.fold_in(jax.random.key(3), i), ()) for i in range(4)])
     table = run.dataset()
     np.testing.assert_allclose(np.asarray(table["q"]).reshape(4, 2)[:, -1], 2 * v, atol=1e-10)
     assert "v" not in table
-    calls, whole = [], program.Program.start
-
-    def breaks_once(self, numbers):
-        calls.append(numbers)
-        if len(calls) == 2:  # the first measures the time of a batch
-            raise OSError("the device was lost")
-        return whole(self, numbers)
-
-    for name, retries in (("b.zarr", 1), ("c.zarr", 0)):
-        calls.clear()
-        monkeypatch.setattr(program.Program, "start", breaks_once)
-        if retries:
-            again = simulated(name, retries)
-            np.testing.assert_array_equal(again.dataset()["result"], table["result"])
-        else:
-            with pytest.raises(RuntimeError, match="the device was lost"):
-                simulated(name, retries)
-    assert capsys.readouterr().err == ""

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import test_scale
 from test_scale import files, recorded
 
 import jaxdyn as jd
@@ -182,59 +183,6 @@ def test_a_worker_killed_in_a_chunk(client, whole, tmp_path):
     assert_same(running.end(), whole(SLOW // 3))
 
 
-@pytest.mark.slow
-def test_all_workers_killed(client, whole, tmp_path):
-    """The nannies start others, which get the study, and the tasks that waited."""
-    running = Running(tmp_path / "a.zarr", client, iterations=SLOW)
-    running.wait_for_chunks(5)
-    kept = {name: (running.out / name).stat().st_mtime_ns for name in files(running.out) if name.startswith("result")}
-    before = pids(client)
-    for pid in before:
-        os.kill(pid, signal.SIGKILL)
-    assert_same(running.end(), whole(SLOW))
-    assert not set(before) & set(pids(client))
-    assert all((running.out / name).stat().st_mtime_ns == time for name, time in kept.items())  # not written again
-
-
-@pytest.mark.slow
-def test_a_worker_leaves_and_another_joins(whole, tmp_path):
-    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
-    with distributed.LocalCluster(n_workers=2, **options) as local, distributed.Client(local) as client:
-        client.wait_for_workers(2)
-        running = Running(tmp_path / "a.zarr", client, iterations=SLOW)
-        running.wait_for_chunks(5)
-        first, second = client.nthreads()
-        client.retire_workers([first], close_workers=True)
-        running.wait_for_chunks(10)
-        local.scale(3)
-        client.wait_for_workers(2)
-        joined = set(client.nthreads()) - {first, second}
-        wait_for(lambda: recorded(running.out) == 60 or any(client.processing()[x] for x in joined), "a task there")
-        assert_same(running.end(), whole(SLOW))
-        assert joined
-
-
-SCRIPT = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-import jaxdyn as jd
-from distributed import Client
-
-def draw(key):
-    return jax.random.uniform(key, (), minval=0.1, maxval=0.9)
-
-def logistic(x):
-    return {"x": jax.lax.fori_loop(0, 300_000, lambda _, x: 3.9 * x * (1 - x), x)}
-
-if __name__ == "__main__":
-    reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
-    with Client(sys.argv[1]) as client:
-        print(jd.scale.evaluate(logistic, draw, samples=240, out=sys.argv[2], reductions=reductions,
-                                resources=jd.scale.Resources(client, batch_size=4, chunk=4, progress=False)).computed)
-"""
-
-
 def start(*command, stdout=subprocess.DEVNULL):
     env = os.environ | {"PYTHONPATH": str(Path(jd.__file__).parents[1]), "JAX_PLATFORMS": "cpu"}
     return subprocess.Popen([sys.executable, *map(str, command)], env=env, stdout=stdout, stderr=subprocess.DEVNULL)
@@ -242,17 +190,15 @@ def start(*command, stdout=subprocess.DEVNULL):
 
 @pytest.mark.slow
 def test_the_client_killed_and_started_again(client, whole, tmp_path):
-    script, out = tmp_path / "script.py", tmp_path / "a.zarr"
-    script.write_text(SCRIPT)
-    address = client.scheduler.address
-    first = start(script, address, out)
+    out, address = tmp_path / "a.zarr", client.scheduler.address
+    first = start("-c", test_scale.SLOW, out, address)
     wait_for(lambda: recorded(out) >= 5, "chunks")
     with pytest.raises(ValueError, match=f"process {first.pid} of .* is writing"):
         evaluate(out, client, iterations=SLOW)
     first.kill()
     first.communicate()
     kept = recorded(out)
-    second = start(script, address, out, stdout=subprocess.PIPE)
+    second = start("-c", test_scale.SLOW, out, address, stdout=subprocess.PIPE)
     computed = int(second.communicate(timeout=LONG)[0])
     # Workers finish the tasks that they have, sixteen at most, until the scheduler misses the client.
     assert 240 - 4 * (kept + 16) <= computed <= 240 - 4 * kept
@@ -304,7 +250,7 @@ def test_the_scheduler_killed_and_started_again(whole, tmp_path):
             running.wait_for_chunks(5)
             scheduler.kill()
             scheduler.wait()
-            with pytest.raises(ConnectionError, match=r"did not come back .*what was finished is kept"):
+            with pytest.raises(ConnectionError, match=r"did not come .*is kept"):
                 running.end()
         kept = recorded(running.out)
         begin()
@@ -316,41 +262,18 @@ def test_the_scheduler_killed_and_started_again(whole, tmp_path):
 
 # From the shell
 
-STUDY = """
-scene = "functions.py"
-out = "here.zarr"
-samples = 12
-duration = 0.1
-points = 3
-[parameters]
-damping = { log_uniform = [0.1, 1.0] }
-[options]
-stepsize = 0.01
-batch_size = 4  # one rollout alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least
-[reductions]
-q = { mean = "q" }
-"""
-FUNCTIONS = """
-import jax.numpy as jnp
-import jaxdyn as jd
-
-def scene(p):
-    system = jd.scenes.double_pendulum().system
-    return jd.Scene(system, forces=(jd.forces.JointDamping(p["damping"] * jnp.ones(2)),))
-
-def states(p):
-    return 0.5 * jnp.ones(2), jnp.zeros(2)
-"""
+# One rollout alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least.
+STUDY = test_scale.STUDY.replace("[options]", "[options]\nbatch_size = 4")
 
 
 @pytest.mark.slow
 def test_sweep_on_clusters(cluster, tmp_path):
     file = tmp_path / "study.toml"
     file.write_text(STUDY)
-    (tmp_path / "functions.py").write_text(FUNCTIONS)
+    (tmp_path / "study.py").write_text(test_scale.FUNCTIONS)
     sweep = ("-m", "jaxdyn", "sweep", file, "--quiet", "--chunk", 3)
     places = {
-        "here": [],
+        "here": ["--out", tmp_path / "here.zarr"],
         "workers": ["--workers", 2, "--out", tmp_path / "workers.zarr"],
         "client": ["--client", cluster.scheduler_address, "--out", tmp_path / "client.zarr"],
     }
@@ -369,7 +292,7 @@ def test_sweep_refuses_places_without_a_scheduler(tmp_path, capsys):
 
     file = tmp_path / "study.toml"
     file.write_text(STUDY)
-    (tmp_path / "functions.py").write_text(FUNCTIONS)
+    (tmp_path / "study.py").write_text(test_scale.FUNCTIONS)
     with dask.config.set({"distributed.comm.timeouts.connect": "300ms"}):
         assert main(["sweep", str(file), "--client", "tcp://127.0.0.1:1"]) == 2
     assert "--client is tcp://127.0.0.1:1, where no scheduler of Dask answers" in capsys.readouterr().err
@@ -405,9 +328,7 @@ def test_a_chunk_that_raises_is_tried_again_and_reported(client, tmp_path, where
     options = {"chunk": 5, "batch_size": 5, "client": client, "progress": False}
     starts = np.arange(40.0)
     function = failing((12.0, 33.0), 2, tmp_path)
-    with pytest.raises(
-        RuntimeError, match=r"of 8 chunks 2 failed in every attempt \(2, 6\), the others are finished"
-    ) as caught:
+    with pytest.raises(RuntimeError, match=r"2 failed .*\(2, 6\)") as caught:
         jd.scale.evaluate(function, starts, out=tmp_path / "a.zarr", resources=jd.scale.Resources(retries=0, **options))
     assert "Chunk 2:\nTraceback" in str(caught.value) and "12.0 is a bad start" in str(caught.value)
     assert recorded(tmp_path / "a.zarr") == 6
@@ -422,9 +343,9 @@ def test_a_chunk_that_raises_is_tried_again_and_reported(client, tmp_path, where
 def test_a_cluster_that_does_not_fit_is_refused(client, tmp_path, monkeypatch):
     out = tmp_path / "a.zarr"
     for other in ("tcp://127.0.0.1:1", object()):
-        with pytest.raises(ValueError, match=r"client is .*; give a dask\.distributed\.Client that is connected"):
+        with pytest.raises(ValueError, match=r"give a dask\.distributed\.Client"):
             evaluate(out, other)
-    with pytest.raises(ValueError, match="devices is given with client"):
+    with pytest.raises(ValueError, match=r"devices .* client"):
         evaluate(out, client, devices=jax.local_devices())
     told = client.get_versions
 
@@ -438,14 +359,13 @@ def test_a_cluster_that_does_not_fit_is_refused(client, tmp_path, monkeypatch):
         return get
 
     for changes, said in (
-        ({"jaxdyn": None}, "has jaxdyn not at all, and this process"),
-        ({"jaxdyn": "0.0.1"}, r"has jaxdyn 0\.0\.1, and this process"),
-        ({"distributed": "2020.1.0"}, r"has distributed 2020\.1\.0, and this process"),
-        ({"python": "3.9.1.final.0"}, r"has python 3\.9\.1"),
+        ({"jaxdyn": None}, "jaxdyn not at all"),
+        ({"jaxdyn": "0.0.1"}, r"jaxdyn 0\.0\.1"),
+        ({"python": "3.9.1.final.0"}, r"python 3\.9\.1"),
     ):
         with monkeypatch.context() as patched:
             patched.setattr(client, "get_versions", versions(**changes))
-            with pytest.raises(ValueError, match=rf"client: worker tcp://.* {said}.*install the same version on both"):
+            with pytest.raises(ValueError, match=rf"worker tcp://.* has {said}.*same version"):
                 evaluate(out, client)
     assert not out.exists()
 
@@ -454,14 +374,10 @@ def test_a_store_that_workers_do_not_see_is_refused(client, tmp_path):
     """The file that marks the store is moved away for the workers."""
     mark = tmp_path / "a.zarr.owner"
     with Cluster(client, mark=(mark, "a text")) as cluster:
-        with pytest.raises(
-            ValueError, match=r"out is in '.*', which worker tcp://.* does not see \(a\.zarr\.owner: .*No such"
-        ):
+        with pytest.raises(ValueError, match=r"worker tcp://.*a\.zarr\.owner: .*No such"):
             cluster.send(lambda: None)
         mark.write_text("another text")
-        with pytest.raises(
-            ValueError, match=r"another file of that name.*file system that the client and all workers share"
-        ):
+        with pytest.raises(ValueError, match="another file of"):
             cluster.send(lambda: None)
 
 
@@ -470,7 +386,7 @@ def test_a_worker_of_another_version_that_joins_gets_no_task(client, monkeypatch
     monkeypatch.setattr("jaxdyn.tasks.worker.package_versions", lambda: package_versions() | {"jaxdyn": "0.0.1"})
     with (
         Cluster(client) as cluster,
-        pytest.raises(ValueError, match=r"worker tcp://.* and this process 0\.0\.1"),
+        pytest.raises(ValueError, match=r"worker tcp://.* 0\.0\.1"),
     ):
         cluster.send(lambda: None)
 
@@ -591,18 +507,6 @@ def robot_and_log():
 
 
 @pytest.mark.long
-def test_cross_validation_of_a_fit(client):
-    """The fits of all folds on workers: the trials of this process, in their order and to the last bit."""
-    model, log = robot_and_log()
-    options = {"terms": ("viscous", "coulomb"), "robust": "auto", "weights": None, "inertia": "mass"}
-    here, there = (jd.identify.fit_robot(model, log, client=one, **options) for one in (None, client))
-    assert here.choice.setting == there.choice.setting and len(here.choice.trials) > 8
-    for one, other in zip(here.choice.trials, there.choice.trials, strict=True):
-        assert one.setting == other.setting
-        np.testing.assert_array_equal(one.squares, other.squares)
-
-
-@pytest.mark.long
 def test_identification_from_the_shell(cluster, tmp_path, capsys):
     """The report of a fit whose cross-validation runs on workers is that of this process."""
     from jaxdyn.cli import main
@@ -627,5 +531,5 @@ def test_without_a_client_no_dask_is_imported(tmp_path, monkeypatch):
     for name in ("dask", "distributed"):
         monkeypatch.setitem(sys.modules, name, None)
     assert evaluate(tmp_path / "a.zarr").success
-    with pytest.raises(ImportError, match=r"client= needs distributed: pip install 'jaxdyn\[scale\]'"):
+    with pytest.raises(ImportError, match=r"distributed: .*jaxdyn\[scale\]"):
         evaluate(tmp_path / "b.zarr", object())
