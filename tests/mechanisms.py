@@ -6,10 +6,10 @@ import numpy as np
 import jaxdyn as jd
 
 
-def slider(mass=1.0):
-    """A body on a rail, without gravity."""
-    builder = jd.ModelBuilder("slider", gravity=None)
-    builder.add_body("box", joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
+def slider(mass=1.0, axis=(1, 0, 0), gravity=None, **limits):
+    """A body on a rail, without gravity unless it is given."""
+    builder = jd.ModelBuilder("slider", gravity=gravity)
+    builder.add_body("box", joint="prismatic", axis=axis, inertia=(mass, (0, 0, 0), (0, 0, 0)), **limits)
     return builder.build()
 
 

@@ -251,6 +251,20 @@ def assert_close(got, want, tol=1e-10, label=""):
     assert error <= tol * size, f"{label}: error {error:.3e}, size {size:.3e}"
 
 
+def placed(rotation, position) -> np.ndarray:
+    """Pose (4, 4)."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, position
+    return pose
+
+
+def adjoint(pose) -> np.ndarray:
+    """Ad of a pose (4, 4), linear part first, by NumPy alone."""
+    R, (x, y, z) = pose[:3, :3], pose[:3, 3]
+    hat = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.block([[R, hat @ R], [np.zeros((3, 3)), R]])
+
+
 def as_dtype(model: jd.Model, dtype) -> jd.Model:
     """The same model with every leaf in another dtype."""
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x).astype(dtype)), model)
@@ -302,10 +316,7 @@ def _unit(x) -> np.ndarray:
 
 
 def _random_pose(rng, reach) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
-    pose[:3, 3] = rng.normal(size=3) * reach
-    return pose
+    return placed(Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), rng.normal(size=3) * reach)
 
 
 def _paths():

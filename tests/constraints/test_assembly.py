@@ -90,13 +90,6 @@ def test_what_is_out_of_reach_is_met_as_near_as_can_be():
             jd.assemble(arm(target), GUESS, atol=wrong)
 
 
-@pytest.mark.slow
-def test_redundant_rows_are_said():
-    state = jd.assemble(jd.scenes.bennett(), jd.scenes.bennett.start()[0])
-    assert "redundant rows of" in str(state) and int(state.dropped.sum()) == 3
-    assert jd.assemble(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0]).redundancies() == []
-
-
 def test_without_constraints_the_guess_is_the_answer():
     q, v = jnp.array([0.3, -0.2]), jnp.array([1.0, 2.0])
     state = jd.assemble(jd.robots.chain(2), q, v)
@@ -111,7 +104,7 @@ def test_without_constraints_the_guess_is_the_answer():
 @pytest.mark.parametrize("guess", [pytest.param(1e308, marks=pytest.mark.slow), np.inf, np.nan])
 def test_a_guess_without_end_is_refused_with_the_open_loop(guess):
     # LAPACK's own error came first, where the path had left the finite numbers.
-    with pytest.raises(ValueError, match="not assembled: loop 'knee' open by"):
+    with pytest.raises(ValueError, match="'knee' open by"):
         jd.assemble(jd.scenes.four_bar(), jnp.full(3, guess), guesses=2)
     state = jd.assemble(jd.scenes.four_bar(), jnp.full(3, guess), guesses=1, throw=False)
     assert state.result == jd.RESULTS.not_assembled

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 
 import jaxdyn as jd
 
@@ -14,9 +15,7 @@ TIMES = np.linspace(0.0, 1.0, 17)
 def bricard():
     """Bricard's linkage and its states on the way through a place where four of its five rows lose rank."""
     scene = jd.scenes.bricard()
-    motion = jd.simulate(
-        scene, *jd.scenes.bricard.start(branch=-1), TIMES, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10)
-    )
+    motion = jd.simulate(scene, *jd.scenes.bricard.start(branch=-1), TIMES, stepsize=within(1e-10))
     return scene, motion.q, motion.v
 
 
@@ -69,7 +68,7 @@ def test_motions_of_a_held_choice(digits):
     scene = exact if digits == 16 else rounded(exact, digits)
     start = jd.assemble(scene, q[0], v[0])
     chosen = jd.constraints.choose_rows(scene, start.q)
-    motion = jd.simulate(chosen, start.q, start.v, TIMES, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10))
+    motion = jd.simulate(chosen, start.q, start.v, TIMES, stepsize=within(1e-10))
     assert bool(motion.success) and int(motion.stats["redundant_rows"]) == 1
     np.testing.assert_allclose(motion.q, q, atol=1e-7 if digits == 16 else 10 * 0.5 * 10.0**-digits)
     again = jd.assemble(chosen, start.q + 0.01, start.v)

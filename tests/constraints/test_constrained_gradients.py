@@ -1,4 +1,4 @@
-"""Derivatives of the final state under constraints: each method against differences and against the others; batches.
+"""Derivatives of the final state under constraints: each method against differences.
 
 The mechanism is a slider-crank given by its Lagrangian, which compiles in a fraction of the time that bodies need.
 """
@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array
-from pinocchio_bridge import assert_close, quick
+from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from jaxdyn import scenes
 
 TS = jnp.asarray([0.0, 0.3])
 METHODS = {"projected": "projected", "multipliers": "multipliers", "reduced": "reduced", "crank": jd.Reduced((0,))}
@@ -92,51 +91,3 @@ def test_derivatives_against_differences(slopes, name):
     want = differences(quick(jax.vmap(lambda x: final(x, METHODS[name]))), 8)
     np.testing.assert_allclose(slopes[name], want, atol=1e-8 * np.abs(want).max())  # h^4 of the differences
     assert (np.abs(slopes[name]).max(0) > 1e-3).all()
-
-
-@pytest.mark.slow
-def test_methods_agree_on_derivatives(slopes):
-    """The motion is one, so its derivatives are, up to the integration's error with steps of 0.01 s."""
-    for name in METHODS:
-        np.testing.assert_allclose(slopes[name], slopes["projected"], atol=1e-6 * np.abs(slopes["projected"]).max())
-
-
-@pytest.mark.slow
-def test_a_thousand_mechanisms_of_different_lengths():
-    """One vmap over crank and rod: every lane stays closed and ends where the crank's angle puts it in closed form."""
-    rng = np.random.default_rng(0)
-    changes = np.zeros((1000, 8))
-    changes[:, 2:4] = rng.uniform(-0.3, 0.3, (1000, 2))
-
-    def run(x):
-        scene, q, v = mechanism(x)
-        solution = jd.simulate(scene, q, v, TS, stepsize=0.01, outputs=("constraint_residual", "energy"))
-        q, v = solution.q[-1], solution.v[-1]
-        return q, v, solution.success, solution.constraint_residual.max(), closed(1.0 + x[2], 2.5 + x[3], q[0], v[0])
-
-    q, v, success, residual, (q_closed, v_closed) = quick(jax.vmap(run))(jnp.asarray(changes))
-    assert np.asarray(success).all() and float(residual.max()) < 1e-12
-    np.testing.assert_allclose(q, q_closed, atol=1e-12)
-    np.testing.assert_allclose(v, v_closed, atol=1e-11)
-    assert np.ptp(np.asarray(q[:, 0])) > 0.05  # they move differently
-    one = quick(run)
-    for i in (0, 500, 999):
-        assert_close(q[i], one(jnp.asarray(changes[i]))[0], 1e-11)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["projected", "reduced"])
-def test_derivatives_of_a_mechanism_of_bodies(method):
-    """Four-bar: the coupler's mass and the start's speed; reverse mode by differences."""
-    base, (q, v) = scenes.four_bar(), scenes.four_bar.start(rate=3.0)
-
-    def final(x):
-        model = base.system.replace(inertias=base.system.inertias.at[1].multiply(1.0 + x[0]))
-        scene = jd.Scene(model, base.constraints)
-        solution = jd.simulate(scene, q, v * (1.0 + x[1]), TS, stepsize=0.02, method=method)
-        return jnp.concatenate([solution.q[-1], solution.v[-1]])
-
-    slope = quick(jax.jacrev(final))(jnp.zeros(2))
-    want = differences(quick(jax.vmap(final)), 2)
-    np.testing.assert_allclose(slope, want, atol=1e-8 * np.abs(want).max())  # h^4 of the differences
-    assert (np.abs(slope).max(0) > 1e-3).all()

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import assert_close, quick
+from pinocchio_bridge import assert_close, quick, random_states
 
 import jaxdyn as jd
 from jaxdyn import inertia, se3
@@ -37,12 +37,8 @@ def pair():
 
 @pytest.fixture(scope="module")
 def state(pair):
-    rng = np.random.default_rng(1)
-    q = rng.normal(size=pair.nq)
-    for place, kind in zip(pair.topology.q_slices, pair.topology.kinds, strict=True):
-        if kind in ("free", "spherical"):
-            q[place][-4:] /= np.linalg.norm(q[place][-4:])
-    return jnp.asarray(q), jnp.asarray(rng.normal(size=pair.nv))
+    q, v, *_ = random_states(pair, 1, 1)
+    return q[0], v[0]
 
 
 def all_constraints():
@@ -251,35 +247,29 @@ def test_names_and_refusals(pair):
     assert [p.name for p in layout(twice)] == ["lock c_joint", "lock c_joint (1)"]
     q, v = jnp.zeros(pair.nq).at[jnp.array([3, 10, 16])].set(1.0), jnp.zeros(pair.nv)
     bad = {
-        "constraints\\[0\\] is a function; wrap": (lambda q, t: q[:1],),
-        "'empty' has no rows": (jd.Holonomic(lambda q, t: q[:0], name="empty"),),
-        "'x': phi returned shape \\(2, 2\\)": (jd.Holonomic(lambda q, t: jnp.eye(2), name="x"),),
-        "'y': A returned shape \\(1, 3\\), expected \\(n, 17\\)": (
-            jd.Pfaffian(lambda q, t: jnp.ones((1, 3)), name="y"),
-        ),
-        "'y': b returned shape \\(2,\\), expected \\(1,\\)": (
-            jd.Pfaffian(lambda q, t: jnp.ones((1, 17)), lambda q, t: q[:2], name="y"),
-        ),
-        "'a-zz': frame 'zz' is not in model 'pair'": (jd.loop("a", None, "zz", None),),
-        "'gear c_joint-e_joint': joint 'e_joint' is spherical": (jd.constraints.gear("c_joint", "e_joint", 1.0),),
-        "'lock nn': joint 'nn' is not in model": (jd.constraints.lock_joint("nn"),),
-        "value has shape \\(1,\\), but joint 'e_joint' is spherical with 4": (
-            jd.constraints.lock_joint("e_joint", 0.0),
-        ),
+        r"constraints\[0\] is a": (lambda q, t: q[:1],),
+        "'empty' has no": (jd.Holonomic(lambda q, t: q[:0], name="empty"),),
+        "'x': phi returned": (jd.Holonomic(lambda q, t: jnp.eye(2), name="x"),),
+        "'y': A returned": (jd.Pfaffian(lambda q, t: jnp.ones((1, 3)), name="y"),),
+        "'y': b returned": (jd.Pfaffian(lambda q, t: jnp.ones((1, 17)), lambda q, t: q[:2], name="y"),),
+        "'a-zz': frame 'zz'": (jd.loop("a", None, "zz", None),),
+        "'gear c_joint-e_joint': joint": (jd.constraints.gear("c_joint", "e_joint", 1.0),),
+        "'lock nn': joint": (jd.constraints.lock_joint("nn"),),
+        "value has shape": (jd.constraints.lock_joint("e_joint", 0.0),),
     }
     for message, constraints in bad.items():
         with pytest.raises(ValueError, match=message):
             rows(jd.Scene(pair, constraints), q, v, 0.0)
     made = {
-        "joint 'hinge' is unknown; choose from": lambda: jd.loop("a", None, "b", None, "hinge"),
-        "both frames are on 'a'": lambda: jd.loop("a", None, "a", None),
+        "joint 'hinge' is": lambda: jd.loop("a", None, "b", None, "hinge"),
+        "both frames are": lambda: jd.loop("a", None, "a", None),
         "length is 0": lambda: jd.constraints.distance("a", None, "b", None, 0.0),
         "radius is -1": lambda: jd.rolling_wheel("a", None, -1.0),
-        "surface_radius is None on a sphere": lambda: jd.rolling_sphere("a", None, 1.0, on="sphere"),
-        "does not fit inside": lambda: jd.rolling_sphere("a", None, 2.0, on="sphere", surface_radius=1.0, inside=True),
+        "surface_radius is None": lambda: jd.rolling_sphere("a", None, 1.0, on="sphere"),
+        "not fit inside": lambda: jd.rolling_sphere("a", None, 2.0, on="sphere", surface_radius=1.0, inside=True),
         "name is ''": lambda: jd.Holonomic(lambda q, t: q, name=""),
-        "phi is 3, which cannot be called": lambda: jd.Holonomic(3),
-        "both joints are 'c_joint'": lambda: jd.constraints.gear("c_joint", "c_joint", 1.0),
+        "phi is 3": lambda: jd.Holonomic(3),
+        "both joints are": lambda: jd.constraints.gear("c_joint", "c_joint", 1.0),
     }
     for message, make in made.items():
         with pytest.raises(ValueError, match=message):

@@ -22,6 +22,7 @@ from jaxdyn.systems.system import displace, retract
 
 # With the slow tests also without kernels.
 BOTH = pytest.mark.parametrize("mode", ["auto", pytest.param("plain", marks=pytest.mark.slow)], indirect=True)
+MORE = [pytest.param(name, marks=pytest.mark.slow) for name in ("andrews", "rolling_coin")]
 DRIFTS = (0.0, 1e-12, 1e-9, 1e-6, 1e-4)
 
 
@@ -98,8 +99,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
 @pytest.mark.long
 @BOTH
 @pytest.mark.parametrize(
-    "name, parameters",
-    [("windows", {"count": 2}), pytest.param("rolling_coin", {}, marks=pytest.mark.slow)],
+    "name, parameters", [("windows", {"count": 2}), pytest.param("rolling_coin", {}, marks=pytest.mark.slow)]
 )
 def test_errors_of_a_step_lose_what_the_projection_removes(name, parameters, mode):
     """e - M^-1 A^T (A M^-1 A^T)^+ A e in numpy, with rows on velocities alone for v."""
@@ -167,10 +167,7 @@ def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "name",
-    ["andrews", "car_axis", "rolling_disk", "chaplygin_sleigh", pytest.param("rolling_coin", marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("name", ["car_axis", "rolling_disk", "chaplygin_sleigh", *MORE])
 @pytest.mark.parametrize("off", [1e-3, *(pytest.param(x, marks=pytest.mark.slow) for x in (1e-6, 0.0))])
 def test_kernels_project_as_matrices_do(name, off):
     """On the constraints to rounding, and as close to the start of the projection as in plain mode."""
@@ -191,37 +188,6 @@ def test_kernels_project_as_matrices_do(name, off):
     size = 20 * off**2 * float(1 + jnp.abs(v).max())
     for x, y in zip(jax.tree.leaves((place, speed, errors)), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(x, y, atol=1e-13 * float(1 + jnp.abs(y).max()) + size, rtol=0)
-
-
-@pytest.mark.slow
-def test_derivatives_are_those_of_the_steps():
-    scene, q, v = drifted("windows", count=2)
-    q, v = q[3], v[3]
-    rng = np.random.default_rng(4)
-    weights = [jnp.asarray(rng.normal(size=x.shape)) for x in (q, v)]
-
-    def value(inertias, q, v, way):
-        here = jd.Scene(scene.system.replace(inertias=inertias), scene.constraints)
-        return sum(jnp.vdot(w, x) for w, x in zip(weights, way(here, q, v, jnp.asarray(0.0)), strict=True))
-
-    def fixed(scene, q, v, t):
-        return in_fixed_steps(None, scene, q, v, t)
-
-    at = scene.system.inertias, q, v
-    steps = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in at)
-    program = quick(
-        lambda *at: [
-            (jax.grad(value, (0, 1, 2))(*at, way), jax.jvp(lambda *x, way=way: value(*x, way), at, steps))
-            for way in (project_state, fixed)
-        ]
-    )
-    computed, want = program(*at)
-    for x, y in zip(jax.tree.leaves(computed), jax.tree.leaves(want), strict=True):
-        assert_close(x, y, 1e-12)
-    # Differences of the values themselves, which end their steps earlier.
-    move = jax.jit(lambda h: value(*(x + h * s for x, s in zip(at, steps, strict=True)), project_state))
-    slope = (move(1e-5) - move(-1e-5)) / 2e-5
-    assert_close(computed[1][1], slope, 1e-7)
 
 
 @pytest.mark.slow

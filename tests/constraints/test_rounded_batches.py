@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from test_rounded_scenes import pair
 
 import jaxdyn as jd
-from benchmarks.overconstrained import MECHANISMS
 
 # The plane y = 0, which the end of the crank meets at a right angle.
 GROUND = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -127,55 +127,6 @@ def test_second_derivatives_and_float32_are_those_of_the_exact_mechanism(folder)
 
 
 @pytest.mark.slow
-def test_grasps_of_a_rounded_hand_are_those_of_the_exact_one():
-    """A planar hand whose contacts have rows in space, and the same with one finger out of its plane by the rounding."""
-    bars, (q, v) = jd.scenes.hand_with_bar(mu=None), jd.scenes.hand_with_bar.start()
-    contacts = [jd.grasp.contact(one.kind, one.finger, one.pose) for one in bars.constraints]  # pyright: ignore
-    cone, tilt = jd.contact.friction_cone("hard-finger", mu=0.8), 4e-6
-    turned = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
-    home = bars.system.home.at[2, :3, :3].set(bars.system.home[2, :3, :3] @ turned)
-    hands = [
-        jd.grasp.Grasp(system, "bar", contacts)
-        for system in (bars.system, bars.system.replace(home=home, rounding=5e-6))
-    ]
-
-    def results(hand):
-        motions = jd.grasp.hand_motions(hand, q)
-        assert motions.object.shape == (3, 3) and motions.internal.shape == (4, 0)
-        motion, held = jd.constrained_dynamics(hand, q, v), jd.grasp.hold(hand, q, cones=cone, preload=0.1)
-        dynamics = jd.grasp.hand_dynamics(hand, q, jnp.ones(3), motions=motions)
-        assert int(motion.rank) == 4 and bool(motion.success) and bool(dynamics.success)
-        assert jd.grasp.force_closure(hand, q, cones=cone).closed
-        basis = jd.grasp.internal_force_basis(hand, q)
-        wrench = jd.grasp.forces_for_wrench(hand, q, jnp.ones(3), 0.5)
-        sizes = jd.grasp.manipulability(hand, q).sigma_min
-        return motion.acceleration, dynamics.rate, basis, wrench, sizes, held.contact_forces, held.torques
-
-    for want, got in zip(*map(results, hands), strict=True):
-        np.testing.assert_allclose(got, want, atol=10 * hands[1].rounding)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["bennett", "bricard", "sarrus"])
-def test_friction_of_zero_changes_no_motion_of_an_overconstrained_loop(name):
-    """Motions in modes keep their rows: they are those of the smooth motion, or have a code, as where Sarrus is flat."""
-    one = MECHANISMS[name][1]()
-    q, v = one.start(np.asarray(one.x), np.asarray(one.rate))
-    free = jd.contact.DryFriction(0.0, 1.0)
-    motions = [
-        jd.simulate(
-            jd.Scene(one.scene.system, one.scene.constraints, forces), q, v, jnp.linspace(0.0, 2.0, 5), throw=False
-        )
-        for forces in ((), (free,))
-    ]
-    assert bool(motions[0].success) and np.abs(motions[0].q[-1] - q).max() > 1.5
-    if bool(motions[1].success):
-        # Tolerances of both runs, 1e-8 each.
-        np.testing.assert_allclose(motions[1].q, motions[0].q, atol=1e-6)
-    assert bool(motions[1].success) == (name != "sarrus")
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("event", ["friction", "contact", "limit", "traced friction"])
 def test_events_are_those_of_the_exact_mechanism(event, folder):
     """Friction of a hinge that slides and sticks, a contact of the crank with the ground, and the end of a joint's range."""
@@ -201,9 +152,7 @@ def test_events_are_those_of_the_exact_mechanism(event, folder):
         whole = jd.Scene(system, scene.constraints, forces)
 
         def run(q, v, whole=whole, options=options):
-            return jd.simulate(
-                whole, q, v, times, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10), throw=False, **options
-            )
+            return jd.simulate(whole, q, v, times, stepsize=within(1e-10), throw=False, **options)
 
         motion = (jax.jit(run) if event == "traced friction" else run)(q, v)
         found.append((motion.result, motion.q[:, order], motion.v[:, order], motion.stats["time_reached"]))

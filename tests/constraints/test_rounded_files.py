@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
@@ -154,7 +155,7 @@ def crank_angles(path, **options):
         warnings.simplefilter("ignore")
         scene = jd.load(path)
     start = jd.assemble(scene, scene.starts["reference"].q, guesses=1)
-    motion = jd.simulate(scene, start.q, start.v, TIMES, stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9), **options)
+    motion = jd.simulate(scene, start.q, start.v, TIMES, stepsize=within(1e-9), **options)
     return np.asarray(motion.q[:, 0] - motion.q[0, 0]), motion, start, scene
 
 
@@ -192,20 +193,9 @@ def test_a_four_bar_with_few_digits_moves_as_with_all(tmp_path, exact, kind, dig
     redundant = {"urdf_3d": 1, "mjcf": 1, "urdf_6d": 3}.get(kind, 3)
     assert int(motion.stats.get("redundant_rows", 0)) == redundant or digits == 12
     (line,) = start.redundancies()
-    assert f"dropped {redundant} redundant row" in line
+    said = f"dropped {redundant} redundant row"
+    assert said in line and line in str(start) and (said in str(motion) or digits == 12)
     assert float(start.gaps.max()) < 20 * rounding
     kept = 1 - np.asarray(start.dropped)
     phi = jax.jit(lambda q: jnp.concatenate([c.position(scene.system, q, 0.0) for c in scene.constraints]))(start.q)
     assert np.abs(kept * np.asarray(phi)).max() < 1e-12
-
-
-@pytest.mark.slow
-def test_a_traced_start_drops_the_same_rows(tmp_path):
-    path = WRITERS["sdf"](tmp_path / "bars", 5, TILT)
-    _, motion, start, scene = crank_angles(path)
-    traced = jax.jit(lambda q, v: jd.simulate(scene, q, v, TIMES, stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9)))(
-        start.q, start.v
-    )
-    assert bool(traced.success) and int(traced.stats["redundant_rows"]) == 3
-    np.testing.assert_allclose(traced.q, motion.q, atol=1e-7)
-    assert "dropped 3 redundant rows" in str(motion)

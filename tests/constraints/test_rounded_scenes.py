@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 
 import jaxdyn as jd
 from benchmarks.overconstrained import MECHANISMS
@@ -154,9 +155,7 @@ def gauge_law(scene, q, v):
 
 
 def moved(scene, q, v):
-    motion = jd.simulate(
-        scene, q, v, jnp.array([0.0, 0.05]), stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10), throw=False
-    )
+    motion = jd.simulate(scene, q, v, jnp.array([0.0, 0.05]), stepsize=within(1e-10), throw=False)
     return motion.success, [motion.q[-1], motion.v[-1]]
 
 
@@ -304,13 +303,7 @@ def as_arrays(value):
     return bool(np.all(success)), [np.asarray(x, float) for x in arrays]
 
 
-CASES = [
-    *(("four_bar", digits) for digits in DIGITS),
-    ("bennett", 5),
-    ("bricard", 5),
-    ("three_legs", 5),
-    ("legs", 5),
-]
+CASES = [*(("four_bar", digits) for digits in DIGITS), ("bennett", 5), ("bricard", 5), ("three_legs", 5), ("legs", 5)]
 
 
 @pytest.fixture(scope="module")
@@ -355,7 +348,7 @@ def test_rows_without_a_gap_have_a_code():
     # As five rows, three of which count, they contradict each other.
     assert not bool(jd.constrained_dynamics(typed, q, v).success)
     assert int(jax.jit(lambda q: jd.degrees_of_freedom(typed, q))(q)) == -1
-    with pytest.raises(ValueError, match="rank of the constraints is not clear"):
+    with pytest.raises(ValueError, match="is not clear"):
         jd.degrees_of_freedom(typed, q)
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from pinocchio_bridge import quick
 from scipy.optimize import brentq, linprog
 
@@ -122,9 +123,7 @@ def test_the_motion_ends_where_the_box_slips_or_tips(size, mu):
     """The time of the closed form, and the code."""
     _, time, _ = end(size, mu)
     scene, (q, v) = scenes.box_on_table(size=size, mu=mu), scenes.box_on_table.start(size=size)
-    solution = jd.simulate(
-        scene, q, v, jnp.linspace(0.0, 8.0, 6), stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10), throw=False
-    )
+    solution = jd.simulate(scene, q, v, jnp.linspace(0.0, 8.0, 6), stepsize=within(1e-10), throw=False)
     assert bool(solution.result == jd.RESULTS.contact_lost)
     np.testing.assert_allclose(solution.stats["time_reached"], time, atol=1e-6)
     assert int(solution.stats["lost_contact"]) == 0

@@ -163,7 +163,7 @@ def test_cuts_that_do_not_reach_the_margin_are_no_answer(monkeypatch):
     G = np.random.default_rng(3).normal(size=(6, 18))
     assert jd.contact.force_closure_of_map(G, [cone] * 6).margin > 1e-3
     monkeypatch.setattr("jaxdyn.contact.forces._ROUNDS", 1)
-    with pytest.raises(RuntimeError, match="the margin was not found to 1e-09 with 1 rounds"):
+    with pytest.raises(RuntimeError, match="with 1 rounds"):
         jd.contact.force_closure_of_map(G, [cone] * 6)
 
 
@@ -178,8 +178,8 @@ def test_units_of_length_do_not_matter():
 
 
 BAD = [
-    (lambda G: jd.contact.force_closure_of_map(G, [HARD] * 2), "G has 9 columns"),
-    (lambda G: jd.contact.force_closure_of_map(G, 3), "cones is a int"),
+    (lambda G: jd.contact.force_closure_of_map(G, [HARD] * 2), "9 columns"),
+    (lambda G: jd.contact.force_closure_of_map(G, 3), "cones is a"),
     (lambda G: jd.contact.force_closure_of_map(G, [HARD] * 3, side="left"), "side is 'left'"),
     (lambda G: jd.contact.force_closure_of_map(G, [HARD] * 3, faces=2), "faces is 2"),
     (lambda G: jd.contact.force_closure_of_map(G[0], [HARD] * 3), "G has shape"),

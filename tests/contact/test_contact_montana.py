@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pinocchio_bridge import quick
+from refusals import refusals
 
 import jaxdyn as jd
 from jaxdyn import se3
@@ -205,31 +206,16 @@ def test_where_a_chart_ends_traced_numbers_are_finite_and_told():
     assert bool(jd.contact.surface_geometry(other, other.coordinates(ball.point(pole))).regular)
 
 
-@pytest.mark.slow
-def test_float32_stays_float32():
-    kinematics = jd.contact.montana(
-        jd.contact.Sphere(jnp.float32(0.1)), jd.contact.Sphere(jnp.float32(0.02)), ETA.astype(jnp.float32)
-    )
-    assert kinematics.J_c.dtype == jnp.float32 == kinematics.forward.dtype
-    np.testing.assert_allclose(kinematics.J_c, sphere_J_c(0.1, 0.02, np.asarray(ETA)), atol=2e-5)
-
-
-BAD = [
+test_bad_input_is_refused = refusals(
     (lambda: jd.contact.Sphere(-0.1), "radius is -0.1"),
     (lambda: jd.contact.Sphere(0.1, poles="w"), "poles is 'w'"),
     (lambda: jd.contact.Ellipsoid([0.1, 0.0, 0.2]), "semi_axes is"),
     (lambda: jd.contact.Ellipsoid([0.1, 0.2]), "semi_axes has shape"),
     (lambda: jd.contact.Cylinder(0.0), "radius is 0.0"),
     (lambda: jd.contact.surface_geometry(jd.contact.Sphere(0.1), jnp.zeros(3)), "alpha has shape"),
-    (
-        lambda: jd.contact.surface_geometry(jd.contact.Sphere(0.1), jnp.array([np.pi / 2, 0.0])),
-        "chart of the Sphere is singular",
-    ),
-    (lambda: jd.contact.surface_geometry("ball", jnp.zeros(2)), "surface is a str"),
-    (
-        lambda: jd.contact.surface_geometry(jd.contact.Parametrised(lambda a: a), jnp.zeros(2)),
-        r"f returned shape \(2,\)",
-    ),
+    (lambda: jd.contact.surface_geometry(jd.contact.Sphere(0.1), jnp.array([np.pi / 2, 0.0])), "Sphere is singular"),
+    (lambda: jd.contact.surface_geometry("ball", jnp.zeros(2)), "surface is a"),
+    (lambda: jd.contact.surface_geometry(jd.contact.Parametrised(lambda a: a), jnp.zeros(2)), "f returned shape"),
     (lambda: jd.contact.montana(jd.contact.Sphere(0.1), jd.contact.Sphere(0.02), jnp.zeros(4)), "eta has shape"),
     (lambda: jd.contact.montana(jd.contact.Plane(), jd.contact.Plane(), ETA), "relative curvature"),
     (
@@ -238,10 +224,4 @@ BAD = [
         ),
         "relative curvature",
     ),
-]
-
-
-@pytest.mark.parametrize("call, match", BAD)
-def test_bad_input_is_refused(call, match):
-    with pytest.raises(ValueError, match=match):
-        call()
+)

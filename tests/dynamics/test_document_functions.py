@@ -64,7 +64,7 @@ def test_a_base_at_rest_changes_nothing(fixed):
     jax.tree.map(np.testing.assert_array_equal, at_rest, given)
     assert_close(at_rest.bias_force, at_rest.C0 @ v + at_rest.phi, 1e-12)
     assert_close(at_rest.bias_force, jd.bias_force(model, q, v), 1e-12)
-    with pytest.raises(ValueError, match=r"base_twist has shape \(3,\), expected \(6,\)"):
+    with pytest.raises(ValueError, match="base_twist has shape"):
         jd.newton_euler_matrices(model, q, v, base_twist=[0, 0, 1])
 
 
@@ -195,12 +195,12 @@ def test_centre_of_mass_coordinates_of_one_body():
 
 def test_centre_of_mass_coordinates_refuse_other_trees():
     arm = jd.robots.chain(2)
-    with pytest.raises(ValueError, match=r"com_dynamics: the roots of model .* are .*\(revolute\)"):
+    with pytest.raises(ValueError, match=r"the roots.*\(revolute\)"):
         jd.dynamics.com_dynamics(arm, jnp.zeros(2), jnp.zeros(2))
     model = random_tree(44, ["free", "revolute"])
     if model.armature is not None:
         heavy = model.replace(armature=jnp.ones(model.nv))
-        with pytest.raises(ValueError, match=r"armature of the base is .*must be zero"):
+        with pytest.raises(ValueError, match="must be zero"):
             jd.dynamics.com_dynamics(heavy, jd.neutral(heavy), jnp.zeros(heavy.nv))
 
 

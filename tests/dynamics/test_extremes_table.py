@@ -80,9 +80,7 @@ def test_beyond_the_longest_stable_step():
 
 def test_too_many_turns_are_refused_by_name():
     model = robots.chain(2, dtype=jnp.float32)
-    with pytest.raises(
-        ValueError, match=r"q0 is 6283.19 rad at index 1, which float32 holds only to .* the 1000 whole turns"
-    ):
+    with pytest.raises(ValueError, match=r"6283\.19.*1000 whole"):
         jd.simulate(model, [0.0, 2000 * np.pi], [0.0, 0.0], [0.0, 1.0])
 
 

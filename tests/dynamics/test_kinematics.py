@@ -231,12 +231,12 @@ def test_one_body_on_a_screw():
 
 def test_refusals():
     model = random_tree(1, ["revolute", "revolute"])
-    with pytest.raises(ValueError, match=r"q has shape \(3,\), expected \(2,\)"):
+    with pytest.raises(ValueError, match="q has shape"):
         kinematics.forward_kinematics(model, jnp.zeros(3))
     with pytest.raises(ValueError, match="did you mean"):
         kinematics.frame_pose(model, jnp.zeros(2), "f11")
     for function in (kinematics.body_jacobian, kinematics.spatial_jacobian):
-        with pytest.raises(ValueError, match="'nothing' is not in model"):
+        with pytest.raises(ValueError, match="'nothing' is not"):
             function(model, jnp.zeros(2), "nothing")
-    with pytest.raises(ValueError, match=r"v has shape \(1,\)"):
+    with pytest.raises(ValueError, match="v has shape"):
         frame_motion.jacobian_dot_v(model, jnp.zeros(2), jnp.zeros(1), "f1")

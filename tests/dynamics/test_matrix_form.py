@@ -132,13 +132,13 @@ def test_derivative_of_the_mass_matrix(parents):
 def test_refusals():
     model = random_tree(1, ["revolute", "planar"])
     for function in (dynamics.first_kind_symbols, dynamics.mass_matrix_derivative):
-        with pytest.raises(ValueError, match=r"v = dq/dt .*'j1' \(planar\)"):
+        with pytest.raises(ValueError, match=r"'j1' \(planar\)"):
             function(model, jnp.zeros(4))
     with pytest.raises(ValueError, match="tip is None"):
         _ = quick(jd.newton_euler_matrices)(random_tree(1, ["revolute"]), jnp.zeros(1), jnp.zeros(1)).Jt
-    with pytest.raises(ValueError, match="frame 'none' is not in model"):
+    with pytest.raises(ValueError, match="frame 'none' is"):
         jd.newton_euler_matrices(model, jnp.zeros(4), jnp.zeros(4), tip="none")
     arm = load_robot("panda_description/urdf/panda.urdf", lock=("finger",))[1]
     base = next(n for n, b in zip(arm.frame_names, arm.topology.frame_bodies, strict=True) if b < 0)
-    with pytest.raises(ValueError, match="fixed to the world"):
+    with pytest.raises(ValueError, match="to the world"):
         jd.newton_euler_matrices(arm, jnp.zeros(7), jnp.zeros(7), tip=base)

@@ -11,7 +11,6 @@ import pytest
 from pinocchio_bridge import as_dtype, assert_close, quick, random_states, random_tree
 
 import jaxdyn as jd
-from jaxdyn.dynamics import recursions
 from jaxdyn.dynamics import world_frame as matrix_form
 from jaxdyn.model.topology import KINDS
 
@@ -140,17 +139,3 @@ def test_derivatives_of_forward_dynamics():
     # Differences of numbers near 1 over steps of 2e-4 keep eleven digits, and leave h^4 times a fifth derivative.
     assert_close(first[2], stencil @ value, 1e-8)
     assert_close(second[2], stencil @ first, 1e-8)
-
-
-@pytest.mark.long
-def test_the_change_of_an_acceleration_is_that_of_its_numbers():
-    """The rule by a second sweep of the recursions against forward and reverse mode of the matrix form."""
-    model = random_tree(7, ["free", "revolute", "prismatic"])
-    q, v, tau = (x[0] for x in random_states(model, 1, seed=3)[:3])
-    wanted = quick(jax.jacfwd(partial(matrix_form.forward_dynamics, model), (0, 1, 2)))(q, v, tau)
-    inside = quick(jax.jacfwd(partial(recursions.aba, model), (0, 1, 2)))(q, v, tau)
-    for way in (jax.jacfwd, jax.jacrev):
-        computed = quick(way(partial(jd.forward_dynamics, model), (0, 1, 2)))(q, v, tau)
-        for x, y, z in zip(computed, wanted, inside, strict=True):
-            np.testing.assert_allclose(x, y, atol=1e-10 * np.abs(y).max(), rtol=0)
-            np.testing.assert_allclose(x, z, atol=1e-10 * np.abs(z).max(), rtol=0)

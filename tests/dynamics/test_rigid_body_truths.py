@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipk, ellipkinc
 
@@ -73,11 +74,7 @@ def motions(bodies):
 
     @jax.jit
     def run(q0, v0):
-        return jax.vmap(
-            lambda q, v: jd.simulate(
-                bodies, q, v, ts, stepsize=jd.simulation.Steps(rtol=1e-13, atol=1e-13), outputs=("energy",)
-            )
-        )(q0, v0)
+        return jax.vmap(lambda q, v: jd.simulate(bodies, q, v, ts, stepsize=within(1e-13), outputs=("energy",)))(q0, v0)
 
     solution = run(jnp.asarray(q0), jnp.asarray(v0))
     assert solution.success.all()
@@ -150,9 +147,7 @@ def test_pendulum():
     ts = np.array([0.0, period, *(row[0] for row in PENDULUM)])
     ts.sort()
     # x = -sin th of the reference turns the other way round than our angle about z.
-    solution = jd.simulate(
-        model, [-np.pi / 2], [0.0], ts, stepsize=jd.simulation.Steps(rtol=1e-14, atol=1e-14), outputs=("energy",)
-    )
+    solution = jd.simulate(model, [-np.pi / 2], [0.0], ts, stepsize=within(1e-14), outputs=("energy",))
     angle, rate = np.asarray(solution.q[:, 0]), np.asarray(solution.v[:, 0])
     sn, cn, _, _ = ellipj(ellipk(0.5) - np.sqrt(9.81) * ts, 0.5)
     # Over 100 s, 40 swings, phase errors add up; to 10 s the bound is 1e-11.

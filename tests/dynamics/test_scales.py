@@ -68,7 +68,7 @@ def test_the_same_motion_and_the_same_refusals(moved, scale, method):
     np.testing.assert_allclose(end, run(four_bar(1.0), q, v)[0], rtol=1e-10)
     for start in ((q + tilted, v), (q, v + tilted)):
         assert run(scene, *start)[1] == RESULTS.inconsistent_start
-        with pytest.raises(ValueError, match=r"q0, v0 are not on the constraints: loop 'knee' (open by|slips at)"):
+        with pytest.raises(ValueError, match=r"'knee' (open by|slips at)"):
             simulate(scene, *start, TIMES, method=method, stepsize=0.01)
 
 
@@ -81,7 +81,7 @@ def test_slides_are_measured_by_the_length_of_the_mechanism(scale):
     # The slide of a closed loop, from the angles.
     want = scale * (np.cos(place[0]) + 2.5 * np.cos(place[0] + place[1]))
     np.testing.assert_allclose(place[2], want, rtol=1e-12)
-    with pytest.raises(ValueError, match="not on the constraints"):
+    with pytest.raises(ValueError, match="on the constraints"):
         simulate(scene, q.at[2].multiply(1.001), v, TIMES, method="multipliers", stepsize=0.01)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from pinocchio_bridge import assert_close, quick, to_pinocchio
+from refusals import refusals
 
 import jaxdyn as jd
 from jaxdyn import robots, scenes
@@ -168,17 +169,11 @@ def test_batch_gradient_and_float32():
     np.testing.assert_allclose(jnp.sum(rough.mass_matrix), values[0], rtol=1e-4)
 
 
-BAD = [
+test_bad_input_is_refused = refusals(
     (lambda: jd.dynamics.workspace_dynamics(ARM, "hand", Q, V), "hand"),
     (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q[:5], V), "q has shape"),
     (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q, V, axes="tip"), "axes is 'tip'"),
-    (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q, V, rows=(0, 6)), r"rows is \(0, 6\)"),
-    (lambda: jd.dynamics.workspace_dynamics(robots.chain(2), "rod_1", Q[:2], V[:2]), "at most nv = 2"),
+    (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q, V, rows=(0, 6)), "rows is"),
+    (lambda: jd.dynamics.workspace_dynamics(robots.chain(2), "rod_1", Q[:2], V[:2]), "nv = 2"),
     (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q, V, least=2.0), "least is 2.0"),
-]
-
-
-@pytest.mark.parametrize("call, match", BAD)
-def test_bad_input_is_refused(call, match):
-    with pytest.raises(ValueError, match=match):
-        call()
+)

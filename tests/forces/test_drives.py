@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_helpers import within
 from scipy.linalg import expm
 
 import jaxdyn as jd
@@ -99,7 +100,7 @@ def test_step_response_of_a_drive(kind):
     computed = np.hstack([motion.drive_state, motion.q, motion.v])
     np.testing.assert_allclose(computed, exact, rtol=1e-10, atol=1e-11)
     np.testing.assert_allclose(motion.torque[:, 0], exact[:, 0], rtol=1e-10, atol=1e-11)
-    adaptive = jd.simulate(scene, q0, v0, ts, **given, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10))
+    adaptive = jd.simulate(scene, q0, v0, ts, **given, stepsize=within(1e-10))
     np.testing.assert_allclose(adaptive.q[:, 0], exact[:, n], atol=1e-9)
     idle = jd.simulate(scene, q0, v0, ts, outputs=("torque",), **FINE)  # without a control the command is zero
     np.testing.assert_allclose(idle.torque[:, 0], [(expm(A * t) @ start[:n])[0] for t in ts], rtol=1e-10, atol=1e-11)
@@ -168,7 +169,7 @@ def test_torque_speed_curve_and_its_kink():
         limits = [jd.forces.TorqueSpeedLimits(stall, 6.0), jd.forces.EffortLimits(5.0)]
         scene = jd.Scene(wheel(), forces=limits)
         given = {"control": lambda q, v, t: jnp.full(1, 100.0), "outputs": ("torque",)}
-        return jd.simulate(scene, zero, zero, ts, stepsize=jd.simulation.Steps(rtol=1e-11, atol=1e-11), **given)
+        return jd.simulate(scene, zero, zero, ts, stepsize=within(1e-11), **given)
 
     stall = jnp.asarray(8.0)
     motion = jax.jit(run)(stall)
@@ -209,7 +210,7 @@ def test_limits_before_and_behind_a_drive():
     """Behind a first-order drive the torque is cut off from T ln(u/(u - L)) on; before it, the drive approaches the limit."""
     T, u, limit, t = 0.1, 3.0, 2.0, 0.4
     lag, cut = jd.forces.FirstOrderDrive(T), jd.forces.EffortLimits(limit)
-    given = {"control": lambda q, v, t: jnp.full(1, u), "stepsize": jd.simulation.Steps(rtol=1e-11, atol=1e-11)}
+    given = {"control": lambda q, v, t: jnp.full(1, u), "stepsize": within(1e-11)}
 
     def speed(forces):
         return jd.simulate(

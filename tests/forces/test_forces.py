@@ -4,7 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import quick
+from motion_helpers import within
+from pinocchio_bridge import quick, random_states
+from refusals import refusals
 
 import jaxdyn as jd
 
@@ -78,7 +80,7 @@ def test_motions_against_closed_forms(sliders):
     q0 = np.concatenate([start, [np.cos(0.5)], np.sin(0.5) * axis])
     v0 = np.concatenate([speed, 0.3 * axis])
     # Dense output is an order of magnitude less accurate than the steps, hence the tight tolerances.
-    solution = jd.simulate(scene, q0, v0, ts, stepsize=jd.simulation.Steps(rtol=1e-14, atol=1e-14))
+    solution = jd.simulate(scene, q0, v0, ts, stepsize=within(1e-14))
     names = list(sliders.joint_names)
     assert names == [*MASS, "turn"]
     expected = {}
@@ -108,12 +110,8 @@ def test_motions_against_closed_forms(sliders):
 
 def sample(model, seed=0):
     """A random state, with unit quaternions."""
-    rng = np.random.default_rng(seed)
-    q = rng.normal(size=model.nq)
-    for kind, place in zip(model.topology.kinds, model.topology.q_slices, strict=True):
-        if kind in ("spherical", "free"):
-            q[place][-4:] /= np.linalg.norm(q[place][-4:])
-    return jnp.asarray(q), jnp.asarray(rng.normal(size=model.nv))
+    q, v, *_ = random_states(model, 1, seed)
+    return q[0], v[0]
 
 
 def test_defaults_of_the_model(arm):
@@ -143,7 +141,7 @@ def test_integers_are_numbers(sliders, convert):
     np.testing.assert_allclose(scene.applied_force(q, v, 1)[:2], expected, rtol=1e-15)
     np.testing.assert_allclose(scene.clip_effort(v), np.clip(v, -0.5, 0.5), rtol=1e-15)
     np.testing.assert_allclose(scene.drive_torque(q, v, 1, v)[0], np.clip(v, -0.5, 0.5), rtol=1e-15)
-    with pytest.raises(ValueError, match=r"v has shape \(2,\), expected \(9,\)"):
+    with pytest.raises(ValueError, match="v has shape"):
         scene.applied_force(q, v[:2])
 
 
@@ -155,7 +153,7 @@ def test_joints_are_taken_in_the_order_named(arm):
     expected[10:], expected[9] = -coefficient[:3] * v[10:], -coefficient[3] * v[9]
     np.testing.assert_allclose(force, expected, rtol=1e-15)
     spring = jd.forces.JointSpring(coefficient, rest=[0.1, 0.2, 0.3, 0.4], joints=("knee_joint", "hip_joint"))
-    with pytest.raises(ValueError, match=r"JointSpring: rest has shape \(4,\), expected a scalar or \(5,\)"):
+    with pytest.raises(ValueError, match="rest has shape"):
         evaluate(spring, arm, q, v)
 
 
@@ -308,60 +306,27 @@ def test_leaves_are_not_weakly_typed():
     assert len(leaves) == 9 and all(x.dtype == jnp.float64 and not x.weak_type for x in leaves)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda m: jd.Scene(3), "system is a int, which has no nq and nv"),
-        (
-            lambda m: jd.Scene(m, forces=jd.forces.JointDamping(1.0)),
-            r"forces is a JointDamping; pass a tuple or a list",
-        ),
-        (lambda m: jd.Scene(m, forces=(3.0,)), r"forces\[0\] is 3.0, which cannot be called"),
-        (lambda m: jd.Scene(m, constraints="loop"), "constraints is a str; pass a tuple"),
-        (lambda m: jd.forces.CoulombFriction(1.0, v_s=0.0), "v_s is 0.0; give a positive smoothing velocity"),
-        (lambda m: jd.forces.Drive(1.0, 1.0, 0.0, effort_limit=-1.0), "effort_limit is -1.0; give positive limits"),
-        (lambda m: jd.forces.ExternalWrench("foot", [1.0]), r"wrench has shape \(1,\), expected \(6,\)"),
-        (lambda m: jd.forces.ExternalWrench("foot", [1.0] * 6, "tool"), "axes is 'tool'; choose 'world' or 'body'"),
-    ],
+def applied(model, force):
+    return jd.Scene(model, forces=(force,)).applied_force(*sample(model))
+
+
+test_what_does_not_fit_is_refused = refusals(
+    (lambda m, _: jd.Scene(3), "system is a"),
+    (lambda m, _: jd.Scene(m, forces=jd.forces.JointDamping(1.0)), "forces is a"),
+    (lambda m, _: jd.Scene(m, forces=(3.0,)), r"forces\[0\] is 3.0"),
+    (lambda m, _: jd.Scene(m, constraints="loop"), "constraints is a"),
+    (lambda m, _: jd.forces.CoulombFriction(1.0, v_s=0.0), "v_s is 0.0"),
+    (lambda m, _: jd.forces.Drive(1.0, 1.0, 0.0, effort_limit=-1.0), "effort_limit is -1.0"),
+    (lambda m, _: jd.forces.ExternalWrench("foot", [1.0]), "wrench has shape"),
+    (lambda m, _: jd.forces.ExternalWrench("foot", [1.0] * 6, "tool"), "axes is 'tool'"),
+    (lambda m, _: applied(m, jd.forces.JointDamping(1.0, joints=("elbow",))), r"\['elbow'\] are not"),
+    (lambda m, _: applied(m, jd.forces.JointDamping([1.0, 2.0])), "coefficient has shape"),
+    (lambda m, _: applied(m, jd.forces.JointSpring(1.0, rest=0.0)), "rest is a"),
+    (lambda m, _: applied(m, jd.forces.Drive(1.0, 1.0, [0.0, 0.0], joints=("knee_joint",))), "target has shape"),
+    (lambda m, _: applied(m, jd.forces.Drive(1.0, [1.0, 1.0], 0.0, joints=("knee_joint",))), "kd has shape"),
+    (lambda m, _: applied(m, jd.forces.ExternalWrench("fot", [0.0] * 6)), "you mean foot"),
+    (lambda m, _: applied(m, lambda system, q, v, t: q), r"forces\[0\] returned shape"),
+    (lambda _, bare: applied(bare, jd.forces.JointDamping()), "JointDamping: no value"),
+    (lambda _, bare: applied(bare, jd.forces.CoulombFriction()), "CoulombFriction: no value"),
+    given=("arm", "sliders"),
 )
-def test_refused_when_made(arm, make, message):
-    with pytest.raises(ValueError, match=message):
-        make(arm)
-
-
-@pytest.mark.parametrize(
-    ("force", "message"),
-    [
-        (
-            jd.forces.JointDamping(1.0, joints=("elbow",)),
-            r"JointDamping: joints \['elbow'\] are not in model 'arm'; it has",
-        ),
-        (jd.forces.JointDamping([1.0, 2.0]), r"coefficient has shape \(2,\), expected a scalar or \(13,\)"),
-        (
-            jd.forces.JointSpring(1.0, rest=0.0),
-            "rest is a scalar, but a joint with a quaternion needs all its coordinates, 15",
-        ),
-        (
-            jd.forces.Drive(1.0, 1.0, [0.0, 0.0], joints=("knee_joint",)),
-            r"target has shape \(2,\), expected a scalar or \(1,\)",
-        ),
-        (
-            jd.forces.Drive(1.0, [1.0, 1.0], 0.0, joints=("knee_joint",)),
-            r"kd has shape \(2,\), expected a scalar or \(1,\)",
-        ),
-        (jd.forces.ExternalWrench("fot", [0.0] * 6), "frame 'fot' is not in model 'arm'; did you mean foot"),
-        (lambda system, q, v, t: q, r"forces\[0\] returned shape \(15,\), expected \(13,\)"),
-    ],
-)
-def test_refused_when_called(arm, force, message):
-    q, v = sample(arm)
-    with pytest.raises(ValueError, match=message):
-        jd.Scene(arm, forces=(force,)).applied_force(q, v)
-
-
-def test_refused_without_a_coefficient(sliders):
-    q, v = jd.neutral(sliders), jnp.zeros(sliders.nv)
-    with pytest.raises(ValueError, match="JointDamping: no value given and the system has no damping"):
-        jd.forces.JointDamping()(sliders, q, v, 0.0)
-    with pytest.raises(ValueError, match="CoulombFriction: no value given and the system has no friction"):
-        jd.forces.CoulombFriction()(sliders, q, v, 0.0)

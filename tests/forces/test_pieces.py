@@ -5,6 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import slider
+from motion_helpers import within
 from scipy.optimize import brentq
 
 import jaxdyn as jd
@@ -14,10 +16,8 @@ X = jnp.asarray([0.5, -1.0])  # height above the stop (m) and velocity (m/s)
 
 
 def mass(damping):
-    builder = jd.ModelBuilder("mass")
-    inertia = (1.0, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
-    builder.add_body("mass", None, "prismatic", inertia, axis=(0, 0, 1), lower=0.0, upper=np.inf)
-    return jd.Scene(builder.build(), forces=[jd.forces.JointStops(K, damping)])
+    model = slider(axis=(0, 0, 1), gravity=(0.0, 0.0, -G), lower=0.0, upper=np.inf)
+    return jd.Scene(model, forces=[jd.forces.JointStops(K, damping)])
 
 
 def thrown_back(x, damping):
@@ -58,7 +58,7 @@ def end(scene, x, **options):
 def test_gradient_through_a_stop_is_that_of_the_closed_form(damping):
     """Ten times the tolerance, of derivatives up to 6; with damping the force jumps where the stop is met."""
     exact = jax.jacfwd(lambda x: thrown_back(x, damping))(X)
-    steps = jd.simulation.Steps(rtol=1e-8, atol=1e-8)
+    steps = within(1e-8)
     slopes, last = jax.jacrev(lambda x: (end(mass(damping), x, stepsize=steps),) * 2, has_aux=True)(X)
     np.testing.assert_allclose(last, thrown_back(X, damping), atol=1e-7)
     np.testing.assert_allclose(slopes, exact, atol=1e-7 * np.abs(exact).max())
@@ -79,10 +79,7 @@ def test_gradient_through_a_stop_by_other_steps(options):
 @pytest.mark.parametrize("adjoint", ["reverse", pytest.param("forward", marks=pytest.mark.slow)])
 def test_gradient_through_a_stop_that_is_met_at_a_save_point(adjoint):
     """To rounding at 0.5 s; half a period of the spring later the body goes back with the velocity v that it had."""
-    builder = jd.ModelBuilder("mass", gravity=None)
-    inertia = (2.0, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
-    builder.add_body("mass", None, "prismatic", inertia, axis=(1, 0, 0), lower=-np.inf, upper=0.2)
-    scene = jd.Scene(builder.build(), forces=[jd.forces.JointStops(200.0, 0.0)])
+    scene = jd.Scene(slider(2.0, lower=-np.inf, upper=0.2), forces=[jd.forces.JointStops(200.0, 0.0)])
 
     def places(v):
         return jd.simulate(scene, jnp.zeros(1), v[None], jnp.asarray([0.0, 0.5, 1.0]), adjoint=adjoint).q[1:, 0]
@@ -109,28 +106,6 @@ def test_gradient_of_steps_through_a_stop():
 
 
 BLOCK = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v, 1)
-
-
-@pytest.mark.slow
-def test_gradient_through_a_reversal_of_sliding_friction():
-    """A block that a force of -6 N stops and pushes back: parabolas on both sides."""
-
-    def run(x):
-        scene = jd.Scene(BLOCK, forces=[jd.forces.SlidingFriction(x[1], G, 1)])
-        return jd.simulate(scene, [0.0], x[:1], [0.0, 1.5], control=pull).q[-1, 0]
-
-    def exact(x):
-        slow, back = 6.0 + x[1] * G, 6.0 - x[1] * G
-        return x[0] ** 2 / (2 * slow) - back * (1.5 - x[0] / slow) ** 2 / 2
-
-    x = jnp.asarray([2.0, 0.3])
-    value, slopes = jax.value_and_grad(run)(x)
-    np.testing.assert_allclose(value, exact(x), atol=1e-8)
-    np.testing.assert_allclose(slopes, jax.grad(exact)(x), atol=1e-7)
-
-
-def pull(q, v, t):
-    return jnp.full_like(v, -6.0)
 
 
 def spring(q, v, t):
@@ -189,7 +164,7 @@ def test_gradient_of_a_spring_with_play():
 @pytest.mark.long
 def test_derivatives_across_kinks_are_refused_where_steps_cannot_end_there():
     """Implicit steps are not cut; their motion is right, their derivative would lack what the time of the stop adds."""
-    options = {"solver": diffrax.Kvaerno3(), "stepsize": jd.simulation.Steps(rtol=1e-6, atol=1e-6)}
+    options = {"solver": diffrax.Kvaerno3(), "stepsize": within(1e-6)}
     np.testing.assert_allclose(end(mass(20.0), X, **options), thrown_back(X, 20.0), atol=1e-4)
     with pytest.raises(ValueError, match=r"PiecewiseForce.*Kvaerno3.*Dopri8"):
         jax.jacrev(lambda x: end(mass(20.0), x, **options))(X)

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import assert_close, quick
-from scipy.integrate import solve_ivp
+from pinocchio_bridge import adjoint, assert_close, placed, quick
 from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
@@ -19,20 +18,6 @@ SPATIAL = NAMES[2:]
 # One contact that is fixed and one that rolls in every run, the others in the slow ones.
 CASES = [pytest.param(name, marks=[pytest.mark.slow] if name in NAMES[:3] else []) for name in NAMES]
 STENCIL, WEIGHTS = (-3, -2, -1, 1, 2, 3), np.array([-1, 9, -45, 45, -9, 1]) / 60
-
-
-def adjoint(pose):
-    """Ad of a pose (4, 4), linear part first."""
-    R, p = pose[:3, :3], pose[:3, 3]
-    hat = np.array([[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]])
-    return np.block([[R, hat @ R], [np.zeros((3, 3)), R]])
-
-
-def placed(rotation, position):
-    """Pose (4, 4)."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose
 
 
 @functools.cache
@@ -287,48 +272,6 @@ def test_box_in_two_soft_fingers():
     assert_close(internal, [0, 0, squeeze, twist, 0, 0, squeeze, twist], 1e-12)
 
 
-def rate_of(q, v):
-    """dq/dt of a hand that ends with a planar or a free object."""
-    if len(q) == len(v):
-        c, s = np.cos(q[-1]), np.sin(q[-1])
-        return np.concatenate([v[:-3], [c * v[-3] - s * v[-2], s * v[-3] + c * v[-2], v[-1]]])
-    turn = Rotation.from_quat([*q[-3:], q[-4]])
-    w, axis = q[-4], q[-3:]
-    spin = 0.5 * np.array([-axis @ v[-3:], *(w * v[-3:] + np.cross(axis, v[-3:]))])
-    return np.concatenate([v[:-6], turn.apply(v[-6:-3]), spin])
-
-
-@pytest.mark.parametrize("name", ["hand_with_bar", "hand_rolling_ball"])
-def test_motion_reduced_and_with_multipliers(name):
-    """Motion from M~ Vdot + C~ V + N~ = F with thetadot = X V, and in all velocities with multipliers, by scipy."""
-    at, count = solved(name), solved(name)["grasp"].nq
-    compute, objects, free = at["compute"], at["objects"], np.zeros(at["grasp"].nv)
-
-    def reduced(t, y):
-        computed = compute(y[:count], padded(y[count:]), at["tau"])["object"]
-        return np.concatenate([rate_of(y[:count], np.array(computed.velocity)), computed.rate])
-
-    def padded(V):
-        v = free.copy()
-        v[objects] = V
-        return v
-
-    def full(t, y):
-        computed = compute(y[:count], y[count:], at["tau"])["full"]
-        return np.concatenate([rate_of(y[:count], y[count:]), computed.acceleration])
-
-    q, v = np.asarray(at["q"]), np.asarray(at["v"])
-    options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-12}
-    few = solve_ivp(reduced, (0.0, 0.05), np.concatenate([q, v[objects]]), **options).y[:, -1]
-    all_ = solve_ivp(full, (0.0, 0.05), np.concatenate([q, v]), **options).y[:, -1]
-    assert np.abs(few[:count] - q).max() > 0.03
-    assert_close(few[:count], all_[:count], 1e-10)
-    assert_close(few[count:], all_[count:][objects], 1e-10)
-    one, other = compute(few[:count], padded(few[count:]), at["tau"]), compute(*np.split(all_, [count]), at["tau"])
-    assert_close(one["object"].velocity, all_[count:], 1e-10)
-    assert_close(one["object"].contact_forces, other["full"].multipliers, 1e-9)
-
-
 def test_rolling_in_a_plane_is_a_differential():
     """No slip means that the way along the face less radius times angle is constant: the row is its gradient."""
     (q, _, A), radius, l1 = disk_rows(), 0.1, 0.3
@@ -343,13 +286,6 @@ def test_rolling_in_a_plane_is_a_differential():
         moved = np.array([[rolled(q + k * step * unit, i, side) for k in STENCIL] for unit in np.eye(7)])
         # The angle of the disk is zero, so its v is qdot.
         np.testing.assert_allclose(A[2 * i + 1], moved @ WEIGHTS / step, atol=1e-11)
-
-
-@pytest.mark.slow
-def test_rolling_disk_is_integrable():
-    """In a plane rolling is holonomic, although its rows are not written so."""
-    computed = jd.reduction.involutive(scenes.hand_with_disk(), scenes.hand_with_disk.start()[0])
-    assert computed.value and computed.ranks == (3, 3)
 
 
 def steady(q, v, t):
@@ -437,36 +373,31 @@ def test_singular_hand_jacobian_gives_a_code():
 
 def test_refusals():
     """What does not fit is refused by name."""
-    with pytest.raises(ValueError, match="kind 'sticky' is unknown"):
+    with pytest.raises(ValueError, match="kind 'sticky' is"):
         jd.grasp.contact("sticky", "tip1", None)
-    with pytest.raises(ValueError, match="in a plane a soft finger is a hard one"):
+    with pytest.raises(ValueError, match="in a plane"):
         jd.contact.wrench_basis("soft-finger", in_plane=True)
     fingers, held = cartesian_fingers("ab"), jd.grasp.contact("rigid", "a", None)
-    with pytest.raises(ValueError, match="constraint 'c': frame 'c' is not in model"):
-        jd.grasp.Grasp(fingers, block(), [jd.grasp.contact("rigid", "c", None)])
-    with pytest.raises(ValueError, match=r"contacts is .*at least one contact"):
-        jd.grasp.Grasp(fingers, block(), [])
-    with pytest.raises(ValueError, match=r"names \['a_joint'\] are in two models"):
-        jd.grasp.Grasp([fingers[0], fingers[0].replace(gravity=None)], block(), [held])
-    with pytest.raises(ValueError, match="different gravity"):
-        jd.grasp.Grasp(fingers, block(gravity=(0.0, 0.0, -9.81)), [held])
-    with pytest.raises(ValueError, match="object 'thing' is no body"):
-        jd.grasp.Grasp(fingers, "thing", [held])
-    with pytest.raises(ValueError, match="part of a tree"):
-        jd.grasp.Grasp(scenes.hand_with_bar().system, "finger1_1", [held])
-    with pytest.raises(ValueError, match="there are no fingers"):
-        jd.grasp.Grasp(block(), "obj", [held])
-    with pytest.raises(ValueError, match="object has 5 bodies"):
-        jd.grasp.Grasp(fingers, scenes.hand_with_bar().system, [held])
-    with pytest.raises(ValueError, match="one of them must be the object"):
-        jd.grasp.Grasp(fingers, block(), [jd.rolling_sphere("a", None, 0.1, surface_body="b")])
-    with pytest.raises(ValueError, match="is on 'b', the object of the grasp is 'obj'"):
-        jd.grasp.Grasp(fingers, block(), [jd.grasp.contact("rigid", "a", None, object="b")])
-    with pytest.raises(ValueError, match="prescribes a slip"):
-        jd.grasp.Grasp(fingers, block(), [jd.Pfaffian(lambda q, t: jnp.zeros((1, 18)), lambda q, t: jnp.ones(1))])
+    slipping = jd.Pfaffian(lambda q, t: jnp.zeros((1, 18)), lambda q, t: jnp.ones(1))
+    bar = scenes.hand_with_bar().system
+    for match, *given in (
+        ("frame 'c' is", fingers, block(), [jd.grasp.contact("rigid", "c", None)]),
+        ("least one contact", fingers, block(), []),
+        (r"\['a_joint'\] are in", [fingers[0], fingers[0].replace(gravity=None)], block(), [held]),
+        ("different gravity", fingers, block(gravity=(0.0, 0.0, -9.81)), [held]),
+        ("object 'thing' is", fingers, "thing", [held]),
+        ("of a tree", bar, "finger1_1", [held]),
+        ("no fingers", block(), "obj", [held]),
+        ("object has 5", fingers, bar, [held]),
+        ("be the object", fingers, block(), [jd.rolling_sphere("a", None, 0.1, surface_body="b")]),
+        ("is on 'b'", fingers, block(), [jd.grasp.contact("rigid", "a", None, object="b")]),
+        ("prescribes a slip", fingers, block(), [slipping]),
+    ):
+        with pytest.raises(ValueError, match=match):
+            jd.grasp.Grasp(*given)
     grasp = scenes.hand_with_bar()
-    with pytest.raises(ValueError, match=r"V has shape \(2,\), expected \(3,\)"):
+    with pytest.raises(ValueError, match="V has shape"):
         jd.grasp.object_dynamics(grasp, solved("hand_with_bar")["q"], jnp.zeros(2))
     loose = scenes.hand_with_bar(kind="frictionless")
-    with pytest.raises(ValueError, match="contacts have 2 rows and the hand 4 joints"):
+    with pytest.raises(ValueError, match="hand 4 joints"):
         jd.grasp.object_dynamics(loose, solved("hand_with_bar")["q"], jnp.zeros(3))

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import assert_close, quick
+from pinocchio_bridge import assert_close, placed, quick
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
@@ -21,13 +21,6 @@ HANDS = {
     "both": ((("hard-finger", 5, ""), ("hard-finger", 2, "")), (5, 2)),
     "flat": ((("hard-finger", 4, "flat"), ("soft-finger", 4, "")), (5, 2)),
 }
-
-
-def placed(rotation, position):
-    """Pose (4, 4)."""
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, position
-    return pose
 
 
 def fingers(hand):
@@ -216,7 +209,7 @@ def test_force_closure_of_a_hand():
     np.testing.assert_allclose(jd.grasp.grasp_map(grasp, q) @ computed.forces, 0, atol=1e-9)
     contacts = [one for one in grasp.constraints[:2]]
     two = jd.grasp.Grasp(grasp.system, "ball", contacts, cones=grasp.cones)
-    with pytest.raises(ValueError, match=r"\['tip1', 'tip2'\] on 'ball' have no force closure: the wrench"):
+    with pytest.raises(ValueError, match="no force closure"):
         jd.grasp.force_closure(two, q, required=True)
     assert not jd.grasp.force_closure(two, q).closed
 
@@ -284,23 +277,24 @@ def test_refusals():
     """What does not fit is refused by name."""
     grasp, q, _, _ = gripped()
     motions = jd.grasp.hand_motions(grasp, q)
-    with pytest.raises(ValueError, match=r"nu has shape \(5,\), expected \(6,\): 6 velocities of the object and 0"):
+    with pytest.raises(ValueError, match="nu has shape"):
         jd.grasp.hand_dynamics(grasp, q, jnp.zeros(5), motions=motions)
-    with pytest.raises(ValueError, match=r"motions has rows for 6 velocities .* the grasp has 3 and 4"):
+    with pytest.raises(ValueError, match="motions has rows"):
         bar = jd.scenes.hand_with_bar()
         jd.grasp.hand_dynamics(bar, jd.scenes.hand_with_bar.start()[0], jnp.zeros(3), motions=motions)
-    with pytest.raises(ValueError, match=r"sizes is \(7, 0\)"):
-        jd.grasp.hand_motions(grasp, q, sizes=(7, 0))
-    with pytest.raises(ValueError, match=r"mu is -0\.5"):
-        jd.contact.friction_cone("hard-finger", -0.5)
-    with pytest.raises(ValueError, match="preload has shape"):
-        jd.grasp.forces_for_wrench(grasp, q, jnp.zeros(6), jnp.zeros(4))
-    with pytest.raises(ValueError, match=r"wrench has shape \(3,\), expected \(6,\)"):
-        jd.grasp.hold(grasp, q, jnp.zeros(3))
-    with pytest.raises(ValueError, match="have no cones"):
-        jd.grasp.hold(jd.scenes.hand_with_ball(mu=None), q)
-    with pytest.raises(ValueError, match=r"contacts \['tip2', 'tip3'\] have no cone"):
-        jd.grasp.hold(grasp, q, cones={"tip1": jd.contact.friction_cone("hard-finger", 0.5)})
+    for match, call in (
+        ("sizes is", lambda: jd.grasp.hand_motions(grasp, q, sizes=(7, 0))),
+        (r"mu is -0\.5", lambda: jd.contact.friction_cone("hard-finger", -0.5)),
+        ("preload has shape", lambda: jd.grasp.forces_for_wrench(grasp, q, jnp.zeros(6), jnp.zeros(4))),
+        ("wrench has shape", lambda: jd.grasp.hold(grasp, q, jnp.zeros(3))),
+        ("have no cones", lambda: jd.grasp.hold(jd.scenes.hand_with_ball(mu=None), q)),
+        (
+            r"'tip3'\] have no",
+            lambda: jd.grasp.hold(grasp, q, cones={"tip1": jd.contact.friction_cone("hard-finger", 0.5)}),
+        ),
+    ):
+        with pytest.raises(ValueError, match=match):
+            call()
     hollow = jd.ModelBuilder("o").add_body("obj", None, "free", (1.0, (0, 0, 0), (0.1, 0.1, -0.1))).build()
-    with pytest.raises(ValueError, match="inertia of the object 'obj' is not positive definite"):
+    with pytest.raises(ValueError, match="not positive definite"):
         jd.grasp.Grasp(grasp.system, hollow, [jd.grasp.contact("hard-finger", "tip1", None)])

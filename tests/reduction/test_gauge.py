@@ -166,9 +166,9 @@ def test_bodies_with_dependent_rows():
     assert_close(computed.multipliers, want.multipliers, 1e-10)
     wrong = quick(lambda q, v: jd.reduction.gauge_invariant(scene, q, v, dof=1).result == jd.RESULTS.singular_basis)
     assert bool(wrong(q, v))
-    with pytest.raises(ValueError, match=r"3 constraint rows leave no degree of freedom of nv = 3: .* give dof"):
+    with pytest.raises(ValueError, match="give dof"):
         jax.jit(lambda q, v: jd.reduction.gauge_invariant(scene, q, v))(q, v)
-    with pytest.raises(ValueError, match=r"rotation has shape \(2, 2\), expected \(3, 3\)"):
+    with pytest.raises(ValueError, match="rotation has shape"):
         jd.reduction.gauge_invariant(scene, q, v, rotation=jnp.eye(2), dof=1)
     sleigh, (q, v) = scenes.chaplygin_sleigh(), scenes.chaplygin_sleigh.start()
     computed = jd.reduction.gauge_invariant(sleigh, q, v)
@@ -211,7 +211,7 @@ def test_connection_of_li_and_wu_moves_a_free_arm(name):
 
 
 def test_connection_asks_for_rates_of_coordinates():
-    with pytest.raises(ValueError, match="not the rates of its coordinates"):
+    with pytest.raises(ValueError, match="of its coordinates"):
         jd.reduction.quasi_connection(jd.scenes.free_box(), jnp.zeros(7), jnp.zeros(6))
 
 

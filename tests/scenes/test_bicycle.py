@@ -126,10 +126,7 @@ def test_critical_speeds(linear):
     def polynomial(v):
         """Coefficients of det(M s^2 + v C1 s + g K0 + v^2 K2), highest power first."""
         terms = np.stack([M, v * C1, GRAVITY * K0 + v * v * K2])
-        return np.polysub(
-            np.polymul(terms[:, 0, 0], terms[:, 1, 1]),
-            np.polymul(terms[:, 0, 1], terms[:, 1, 0]),
-        )
+        return np.polysub(np.polymul(terms[:, 0, 0], terms[:, 1, 1]), np.polymul(terms[:, 0, 1], terms[:, 1, 0]))
 
     def discriminant(v):
         roots = np.roots(polynomial(v))

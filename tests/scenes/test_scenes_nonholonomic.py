@@ -94,17 +94,6 @@ def test_accelerations_of_balls_on_planes():
     assert_close(solution.multipliers, 1.4 * np.array([9.81 * np.cos(slope), -2 / 7 * pull, 0.0]), 1e-12)
 
 
-@pytest.mark.slow
-def test_ball_on_an_incline():
-    """A parabola over 10 s."""
-    slope = 0.02
-    scene = scenes.ball_on_incline(slope=slope, radius=0.5)
-    t = np.array([0.0, 2.0, 10.0])
-    computed = motion(scene, scenes.ball_on_incline.start(radius=0.5, velocity=(0.1, 0.5)), t, 0.1)
-    want = np.stack([0.1 * t + 5 / 14 * 9.81 * np.sin(slope) * t**2, 0.5 * t, 0 * t + 0.5], 1)
-    np.testing.assert_allclose(computed.q[:, :3], want, atol=1e-10)
-
-
 def by_hand(mass_matrix, bias, rows, q, v, tau):
     """Accelerations of M a + h = tau + A^T lam, A a = -(dA/dt) v in coordinates; dA/dt by a complex step."""
     M, h, A = mass_matrix(q), bias(q, v), rows(q)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from motion_helpers import within
+from refusals import refusals
 from scipy.optimize import brentq
 
 import jaxdyn as jd
@@ -93,18 +94,6 @@ def test_steps_of_fixed_length_have_gradients_through_events():
     for i, got in enumerate(run(*values)[1]):
         up, down = (run(*(x + sign * h * (i == k) for k, x in enumerate(values)))[0] for sign in (1, -1))
         assert abs(float(got) - float(up - down) / (2 * h)) < 1e-5 * max(1.0, abs(float(got)))
-
-
-@pytest.mark.slow
-def test_steps_of_fixed_length_that_are_too_long_say_so():
-    spring = jd.forces.JointSpring(jnp.asarray([400.0]), jnp.asarray([0.0]))
-    scene = jd.Scene(block().system, forces=(*block().forces, spring))
-    coarse, fine = (
-        jd.simulate(scene, [0.4], [0.0], [0.0, 3.0], stepsize=jd.simulation.Steps(step, max_steps=1024), throw=False)
-        for step in (0.08, 0.005)
-    )
-    assert coarse.result == jd.RESULTS.coarse_steps
-    assert fine.success
 
 
 def test_friction_balances_at_rest_and_lies_on_the_cone_while_it_slides(shaken):
@@ -263,23 +252,6 @@ def test_painleves_rod_is_stopped_by_an_impulse_and_one_pressed_into_the_ground_
     assert run(*given, np.full(4, 0.3)).success.tolist() == [True, True, True, False]
 
 
-@pytest.mark.slow
-def test_rocking_to_rest_ends_with_a_code():
-    """A slender box that rocks hits the ground ever sooner: infinitely many times before it rests."""
-    scene = box(mu=2.0, size=(0.2, 0.6))
-    angle = 0.15
-    lean = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    at = -lean @ np.array([-0.1, -0.3])
-    motion = jd.simulate(
-        scene, [*at, angle], jnp.zeros(3), jnp.linspace(0, 5.0, 6), events=[jd.events.ModeSwitches(40)], throw=False
-    )
-    assert motion.result == jd.RESULTS.too_many_events
-    times = np.asarray(motion.events.time)
-    assert (np.diff(times) >= 0).all()
-    with pytest.raises(RuntimeError, match="max_events"):
-        jd.simulate(scene, [*at, angle], jnp.zeros(3), jnp.linspace(0, 5.0, 6), events=[jd.events.ModeSwitches(40)])
-
-
 def differences(f, at, steps):
     """Central differences of fourth order."""
     return np.array([(8 * (f(at + s) - f(at - s)) - (f(at + 2 * s) - f(at - 2 * s))) / (12 * s.sum()) for s in steps])
@@ -340,23 +312,6 @@ def test_second_derivatives_go_through_events():
 
 
 @pytest.mark.slow
-def test_gradients_go_through_an_impact():
-    """Of the box that lands on a corner while it turns: start and friction."""
-    ts = jnp.linspace(0.0, 0.35, 3)
-
-    def computed(p):
-        q0, v0 = jnp.stack([0 * p[1], p[1], p[2]]), jnp.stack([p[3], 0 * p[3], 0 * p[3]])
-        motion = jd.simulate(box(p[0]), q0, v0, ts, stepsize=within(1e-12), events=[jd.events.ModeSwitches(6)])
-        return jnp.concatenate([motion.q.ravel(), motion.v.ravel(), motion.events.time[:2]])
-
-    at = jnp.asarray([0.4, 0.5, 0.3, 0.7])
-    weights = jnp.asarray(np.random.default_rng(0).normal(size=20))
-    values = jax.jit(lambda p: computed(p) @ weights)
-    gradient = jax.jit(jax.grad(lambda p: computed(p) @ weights))(at)
-    np.testing.assert_allclose(gradient, differences(values, at, 1e-4 * jnp.eye(4)), atol=1e-6)  # of the differences
-
-
-@pytest.mark.slow
 def test_friction_in_proportion_to_a_multiplier_of_both_sides():
     """A bead on a rough hoop without gravity: N = m v^2/R either way, so v = v0/(1 + mu v0 t/R)."""
     system = jd.LagrangianSystem(lambda q, v, t, p: 0.5 * jnp.sum(v * v) - p["g"] * q[1], 2, parameters={"g": 0.0})
@@ -413,63 +368,22 @@ def test_belt_drags_a_block_along_until_the_spring_is_stronger():
     np.testing.assert_allclose(motion.q[motion.ts > slips, 0][t < stuck], x[t < stuck], atol=1e-9)
 
 
-@pytest.mark.slow
-def test_float32_finds_the_same_events():
-    with jax.enable_x64(False):
-        scene = jd.Scene(jd.scenes.sliding_block().system, forces=(jd.contact.DryFriction(MU, G, 0, static=MU_S),))
-        motion = jd.simulate(scene, [0.0], [2.0], jnp.linspace(0.0, 4.0, 5), control=load, stepsize=within(1e-5))
-        assert motion.q.dtype == jnp.float32 and motion.success
-        assert list(motion.events.name[:4]) == ["friction: turn", "friction: stick", "friction: slip", ""]
-        np.testing.assert_allclose(motion.events.time[:3], [2.135119, 3.427974, 3.620121], atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: jd.contact.DryFriction(-0.1, 1.0), "0 <= friction"),
-        (lambda: jd.contact.DryFriction(0.5, 1.0, static=0.4), "static"),
-        (lambda: jd.contact.DryFriction(0.5, 1.0, -1), "along"),
-        (lambda: jd.contact.DryFriction(0.5, 1.0, smoothing=0.0), "smoothing"),
-        (lambda: jd.contact.UnilateralContact("lane"), "ground_contact"),
-        (lambda: jd.contact.ground_contact("ball", radius=-1.0), "radius"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=-0.1), "stepsize"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=diffrax.PIDController(1e-6, 1e-6)), "stepsize"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, solver=diffrax.Kvaerno5()), "solver"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, adjoint="backsolve"), "adjoint"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, outputs=("work",)), "outputs"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, events=[jd.events.ModeSwitches(0)]), "max_events"),
-        (lambda: jd.simulate(block(normal="rail"), [0.0], [1.0], TS), "rail"),
-        (lambda: jd.constrained_dynamics(block(), jnp.zeros(1), jnp.zeros(1)), "CoulombFriction"),
-    ],
+test_what_does_not_fit_is_refused = refusals(
+    (lambda: jd.contact.DryFriction(-0.1, 1.0), "0 <= friction"),
+    (lambda: jd.contact.DryFriction(0.5, 1.0, static=0.4), "static"),
+    (lambda: jd.contact.DryFriction(0.5, 1.0, -1), "along"),
+    (lambda: jd.contact.DryFriction(0.5, 1.0, smoothing=0.0), "smoothing"),
+    (lambda: jd.contact.UnilateralContact("lane"), "ground_contact"),
+    (lambda: jd.contact.ground_contact("ball", radius=-1.0), "radius"),
+    (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=-0.1), "stepsize"),
+    (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=diffrax.PIDController(1e-6, 1e-6)), "stepsize"),
+    (lambda: jd.simulate(block(), [0.0], [1.0], TS, solver=diffrax.Kvaerno5()), "solver"),
+    (lambda: jd.simulate(block(), [0.0], [1.0], TS, adjoint="backsolve"), "adjoint"),
+    (lambda: jd.simulate(block(), [0.0], [1.0], TS, outputs=("work",)), "outputs"),
+    (lambda: jd.simulate(block(), [0.0], [1.0], TS, events=[jd.events.ModeSwitches(0)]), "max_events"),
+    (lambda: jd.simulate(block(normal="rail"), [0.0], [1.0], TS), "rail"),
+    (lambda: jd.constrained_dynamics(block(), jnp.zeros(1), jnp.zeros(1)), "CoulombFriction"),
 )
-def test_what_does_not_fit_is_refused(make, words):
-    with pytest.raises(ValueError, match=words):
-        make()
-
-
-@pytest.mark.slow
-def test_start_pressed_into_the_ground_is_refused():
-    motion = jd.simulate(box(), [0.0, 0.05, 0.0], jnp.zeros(3), [0.0, 1.0], throw=False)
-    assert motion.result == jd.RESULTS.inconsistent_start
-
-
-@pytest.mark.slow
-def test_boxes_that_tumble_lose_energy_and_stay_above_the_ground():
-    """64 of them at once, each with events of its own, equal to one alone."""
-    rng, ts = np.random.default_rng(0), jnp.linspace(0.0, 1.0, 6)
-    q0 = jnp.asarray(np.c_[np.zeros(64), 0.45 + 0.1 * rng.random(64), rng.uniform(-0.5, 0.5, 64)])
-    v0, mu = jnp.asarray(rng.normal(size=(64, 3))), jnp.asarray(rng.uniform(0.1, 0.6, 64))
-
-    def motion(mu, q0, v0):
-        return jd.simulate(box(mu), q0, v0, ts, outputs=("energy",), **TIGHT)
-
-    batch = jax.jit(jax.vmap(motion))(mu, q0, v0)
-    assert batch.success.all() and int(batch.events.count.min()) >= 1
-    assert np.diff(batch.energy, axis=1).max() < 1e-6  # of 20 J, by the dense output between steps
-    angle = batch.q[..., 2]
-    bottom = batch.q[..., 1] - 0.2 * jnp.abs(jnp.sin(angle)) - 0.1 * jnp.cos(angle)
-    assert bottom.min() > -1e-8  # of the dense output
-    np.testing.assert_allclose(batch.q[7], motion(mu[7], q0[7], v0[7]).q, atol=1e-9)
 
 
 def test_modes_that_flip_without_end_are_not_found(monkeypatch):
@@ -499,24 +413,6 @@ def test_modes_that_flip_without_end_are_not_found(monkeypatch):
     change = transitions.Transition(None, None, None, None, ~choice.wrong[0], jnp.asarray(False), None)
     ((paradox, _), (unsettled, code)) = _cases(change)
     assert bool(unsettled) and not bool(paradox) and code is jd.RESULTS.no_contact_mode
-
-
-@pytest.mark.slow
-def test_constraints_are_closed_at_coarse_tolerances_too():
-    """A rod that turns by a radian a step under friction: save points are on the circle, or the steps have a code."""
-    rod_scene = jd.scenes.pendulum_in_plane()
-    along = jd.Pfaffian(lambda q, t: jnp.stack([-q[1], q[0]]), name="along")
-    friction = jd.contact.DryFriction(0.1, 1.0, along, name="friction")
-    scene = jd.Scene(rod_scene.system, rod_scene.constraints, (friction,))
-
-    def run(**options):
-        return jd.simulate(scene, [0.0, -1.0], [30.0, 0.0], jnp.linspace(0, 1.0, 3), throw=False, **options)
-
-    coarse = run(stepsize=within(0.1))
-    assert bool(coarse.success)
-    np.testing.assert_allclose(np.linalg.norm(coarse.q, axis=1), 1.0, atol=1e-10)
-    # No circle is within reach of steps of three turns.
-    assert run(stepsize=0.2).result == jd.RESULTS.coarse_steps
 
 
 def point(friction, restitution=0.0):

@@ -155,45 +155,6 @@ def test_motions_are_those_without_kernels(name, options):
 
 
 @pytest.mark.slow
-def test_dependent_rows_take_the_careful_way():
-    """Two rows that say the same, which kernels do not serve anywhere."""
-    once = scenes.pendulum_in_plane()
-    scene = jd.Scene(once.system, (*once.constraints, *once.constraints))
-    q, v = (jnp.asarray(x) for x in scenes.pendulum_in_plane.start())
-
-    def run(scene):
-        ts = jnp.linspace(0.0, 0.2, 3)
-        return jax.jit(lambda q, v: jd.simulate(scene, q, v, ts, throw=False, stepsize=within(1e-8)))(q, v)
-
-    computed = run(scene)
-    with jd.compilation("plain"):
-        plain = run(scene)
-    assert computed.result == plain.result
-    for wanted in (plain, run(once)):
-        np.testing.assert_allclose(computed.q, wanted.q, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(computed.v, wanted.v, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_constrained_motion():
-    scene, (q, v) = cases()["rolling_disk"].build()
-    v, ts = jnp.asarray(v), jnp.linspace(0.0, 0.5, 3)
-
-    def end(v, adjoint):
-        computed = jd.simulate(scene, q, v, ts, throw=False, stepsize=within(1e-6), adjoint=adjoint)
-        return jnp.sum(computed.q[-1] ** 2)
-
-    def reverse():
-        return jax.jit(jax.grad(lambda v: end(v, "reverse")))(v)
-
-    computed, forward = reverse(), jax.jit(jax.jacfwd(lambda v: end(v, "forward")))(v)
-    with jd.compilation("plain"):
-        wanted = reverse()
-    np.testing.assert_allclose(computed, wanted, rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(forward, wanted, rtol=1e-5, atol=1e-5)  # steps of their own at tolerances of 1e-6
-
-
-@pytest.mark.slow
 def test_long_chains_that_are_built_in_a_program():
     q = 0.3 * jnp.cos(jnp.arange(130))
 

@@ -88,9 +88,7 @@ def test_steps_that_are_too_many_for_the_dtype():
 def test_what_to_do_is_said():
     """Contact by penalty at 1e8 N/m with steps of 1 ms, which ended at a wrong place without a word."""
     scene = jd.Scene(slider(), forces=(jd.forces.JointSpring(1e8), jd.forces.JointDamping(1e4)))
-    with pytest.raises(
-        RuntimeError, match=r"stopped at t = 0.002 s of 0.002 s. The fixed steps are too long.*Fix: take a smaller"
-    ):
+    with pytest.raises(RuntimeError, match=r"too long.*Fix"):
         jd.simulate(scene, [0.01], [0.0], [0.0, 0.002], stepsize=0.001)
 
 

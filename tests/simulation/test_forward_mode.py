@@ -29,7 +29,7 @@ def stiffly(q, **options):
 def test_forward_mode_names_its_option(function):
     """Under jit and outside, and for a single direction; the option gives the Jacobian of reverse mode."""
     for derivative in (jax.jacfwd(function), jax.jit(jax.jacfwd(function)), lambda q: jax.jvp(function, (q,), (q,))):
-        with pytest.raises(ValueError, match=r'forward mode .* needs adjoint="forward", of jd.simulate or jd.stepper'):
+        with pytest.raises(ValueError, match='needs adjoint="forward"'):
             derivative(Q)
     by_rows = jax.jit(jax.jacrev(function))(Q)
     np.testing.assert_allclose(

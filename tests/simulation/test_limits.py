@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from motion_helpers import within
+from refusals import refusals
 
 import jaxdyn as jd
 
@@ -34,34 +35,16 @@ def test_a_motion_ends_where_a_joint_meets_its_limit(cart):
     np.testing.assert_allclose(end.stats["time_reached"], 2.0, rtol=2e-8)
     assert int(end.stats["passed_limit"]) == 0
     assert np.isfinite(end.q[:5]).all() and np.isnan(end.q[5:]).all()
-    with pytest.raises(RuntimeError, match=r"at t = 2 s of 3 s. A joint passed .* the joint is 'cart_joint'"):
+    with pytest.raises(RuntimeError, match=r"2 s.*'cart_joint'"):
         jd.simulate(cart, [0.0], [0.0], TS, control=push, events=[jd.events.JointLimit()])
     # As many times as before, so that it is the same program.
     free = jd.simulate(cart, [0.0], [0.0], 0.6 * np.asarray(TS), control=push, events=[jd.events.JointLimit()])
     assert bool(free.success) and int(free.stats["passed_limit"]) == -1
 
 
-@pytest.mark.slow
-def test_lanes_end_at_their_own_times(cart):
-    """From -v: down and back up again, or through the lower limit; q(t) = v t + t^2 / 4."""
-    speeds = jnp.array([[0.0], [-0.9], [-1.2], [0.5]])
-    run = jax.jit(
-        jax.vmap(lambda v: jd.simulate(cart, jnp.zeros(1), v, TS, control=push, events=[jd.events.JointLimit()]))
-    )
-    computed = run(speeds)
-    v = np.asarray(speeds)[:, 0]
-    upper, lower = 2 * (-v + np.sqrt(v**2 + 1)), -2 * v[2] - 2 * np.sqrt(v[2] ** 2 - 1)
-    times = np.where(np.arange(4) == 2, lower, upper)
-    ends = times < 3.0
-    assert ends.tolist() == (computed.result == jd.RESULTS.joint_limit_passed).tolist() == [True, False, True, True]
-    np.testing.assert_allclose(computed.stats["time_reached"][ends], times[ends], rtol=1e-7)
-
-
 @pytest.mark.long
 def test_a_motion_that_goes_on_tells(cart):
-    with pytest.warns(
-        jd.simulation.JointLimitWarning, match=r"'cart_joint' is at 1.5625, its upper limit is 1, at t = 2.5 s"
-    ):
+    with pytest.warns(jd.simulation.JointLimitWarning, match="1.5625.*2.5 s"):
         told = jd.simulate(cart, [0.0], [0.0], TS, control=push, events=[jd.events.JointLimit(stop=False)])
     assert bool(told.success) and int(told.stats["passed_limit"]) == 0
     np.testing.assert_allclose(told.q[:, 0], TS**2 / 4, atol=1e-9)
@@ -73,12 +56,21 @@ def test_a_motion_that_goes_on_tells(cart):
     assert "passed_limit" not in jd.simulate(cart, [0.0], [0.0], TS[:5], control=push).stats
 
 
-def test_refusals(cart):
-    with pytest.raises(ValueError, match="limits is 'hard'"):
-        jd.simulate(cart, [0.0], [0.0], TS, limits="hard")  # pyright: ignore[reportCallIssue]
-    system = jd.LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 1)
-    with pytest.raises(ValueError, match="a LagrangianSystem has no joint limits"):
-        jd.simulate(system, [0.0], [0.0], TS, events=[jd.events.JointLimit()])
+def run(system, **options):
+    return jd.simulate(system, [0.0], [0.0], TS, **options)
+
+
+MASS = jd.LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 1)
+test_what_does_not_fit_is_refused = refusals(
+    (lambda cart: run(cart, limits="hard"), "limits is 'hard'"),
+    (lambda cart: run(MASS, events=[jd.events.JointLimit()]), "no joint limits"),
+    (lambda cart: run(cart, events=[jd.events.JointLimit(), jd.events.JointLimit(False)]), "has 2 of"),
+    (lambda cart: run(cart, events=[jd.events.Terminal(lambda q, v, t: q)]), "return one number"),
+    (lambda cart: run(cart, events=[jd.events.Terminal(lambda q, v, t: q[0] < 1)]), "returned a bool"),
+    (lambda cart: run(cart, events=[jd.events.ContactLost()]), "no cones"),
+    (lambda cart: jd.events.Terminal(lambda q: q), "Terminal: function"),
+    given=("cart",),
+)
 
 
 class Below(eqx.Module):
@@ -118,23 +110,24 @@ def test_a_terminal_event_ends_a_run_at_its_time():
     assert int(fall(1.9, lambda q, v, t: v[0] + 2.0).stats["terminal_event"]) == 1
 
 
-OTHER_STEPS = [{}, {"stepsize": 0.01}, {"solver": jd.solvers.Rodas5P()}]
+OTHER_STEPS = {"adaptive": {}, "fixed": {"stepsize": 0.01}, "stiff": {"solver": jd.solvers.Rodas5P()}}
 
 
-@pytest.mark.parametrize("options", OTHER_STEPS, ids=["adaptive", "fixed", "stiff"])
-@pytest.mark.parametrize("function", [lambda q, v, t: jnp.sqrt(q[0] - 1), lambda q, v, t: jnp.log(q[0])])
-def test_a_function_that_is_nan_past_its_zero_ends_the_run_there(options, function):
-    np.testing.assert_allclose(fall(-9.0, function, **options).stats["time_reached"], np.sqrt(2 / 9.81), rtol=1e-9)
+@pytest.mark.parametrize(("how", "function"), [("adaptive", jnp.sqrt), ("fixed", jnp.log), ("stiff", jnp.sqrt)])
+def test_a_function_that_is_nan_past_its_zero_ends_the_run_there(how, function):
+    zero = 1.0 if function is jnp.sqrt else 0.0  # of the function, by which its argument is shifted
+    run = fall(-9.0, lambda q, v, t: function(q[0] - zero), **OTHER_STEPS[how])
+    np.testing.assert_allclose(run.stats["time_reached"], np.sqrt(2 / 9.81), rtol=1e-9)
 
 
-@pytest.mark.parametrize("options", OTHER_STEPS, ids=["adaptive", "fixed", "stiff"])
-@pytest.mark.parametrize("level", [2.0, 3.0, np.nan])
-def test_a_terminal_event_must_be_above_zero_at_the_start(options, level):
+@pytest.mark.parametrize("how", OTHER_STEPS)
+def test_a_terminal_event_must_be_above_zero_at_the_start(how):
     """At zero, the method and rounding would decide between the start and the first save point."""
-    with pytest.raises(ValueError, match="at the start"):
-        fall(level, **options)
-    run = jax.jit(lambda level: fall(level, throw=False, **options))(level)
-    assert run.result == jd.RESULTS.bad_event and not bool(run.success)
+    run = jax.jit(lambda level: fall(level, throw=False, **OTHER_STEPS[how]))
+    for level in (2.0, 3.0, np.nan):
+        with pytest.raises(ValueError, match="at the start"):
+            fall(level, **OTHER_STEPS[how])
+        assert run(level).result == jd.RESULTS.bad_event and not bool(run(level).success)
 
 
 @pytest.mark.long
@@ -174,19 +167,3 @@ def test_former_arguments_warn_with_the_new_form(cart, former, present, text):
     wanted = run(**present)
     np.testing.assert_array_equal(end.q, wanted.q)
     assert end.poses.keys() == wanted.poses.keys() and end.result == wanted.result
-
-
-@pytest.mark.parametrize(
-    ("events", "match"),
-    [
-        ([jd.events.JointLimit(), jd.events.JointLimit(False)], "has 2 of"),
-        ([jd.events.Terminal(lambda q, v, t: q)], "return one number"),
-        ([jd.events.Terminal(lambda q, v, t: q[0] < 1)], "returned a bool"),
-        ([jd.events.ContactLost()], "no cones"),
-    ],
-)
-def test_events_that_do_not_fit_are_refused(cart, events, match):
-    with pytest.raises(ValueError, match=match):
-        jd.simulate(cart, [0.0], [0.0], TS, events=events)
-    with pytest.raises(ValueError, match="Terminal: function"):
-        jd.events.Terminal(lambda q: q)

