@@ -101,11 +101,11 @@ batch(lambda x: jd.forward_dynamics(many, x * jnp.ones(40), jnp.ones(40), jnp.on
 """,
     "derivatives": """
 end = lambda options: lambda x: jd.simulate(scene, q, x * v, ts, throw=False, stepsize=0.01, **options).q[-1, 0]
-for derivative, options in ((jax.hessian, {}), (jax.jacfwd, {"adjoint": "forward"})):
-    batch(derivative(lambda q: jd.constrained_dynamics(scene, q, v).acceleration[0]), qs)
-    batch(derivative(lambda q: jd.constraints.projections(scene, q)[0].sum()), qs)
-    batch(derivative(lambda x: jd.assemble(scene, q, hold={"1": x}).q[1]), x)
-    batch(derivative(lambda q: jd.dynamics.workspace_dynamics(arm, arm.body_names[-1], q, q).mass_matrix[0, 0]), at)
+# Forward mode over reverse mode, so that both are in the program.
+batch(jax.hessian(lambda q: jd.constrained_dynamics(scene, q, v).acceleration[0]), qs)
+batch(jax.hessian(lambda q: jd.constraints.projections(scene, q)[0].sum()), qs)
+batch(jax.hessian(lambda x: jd.assemble(scene, q, hold={"1": x}).q[1]), x)
+batch(jax.hessian(lambda q: jd.dynamics.workspace_dynamics(arm, arm.body_names[-1], q, q).mass_matrix[0, 0]), at)
 for derivative, options in ((jax.jacrev, {}), (jax.jacfwd, {"adjoint": "forward"})):
     batch(derivative(end(options | {"method": "reduced"})), x)
     batch(derivative(end(options | {"solver": jd.solvers.Rodas5P()})), x)
