@@ -1,8 +1,10 @@
 """JAX of several versions, those of the future included: what jaxdyn uses of it, and what it does where that has changed."""
 
+import ast
 import functools
 import importlib.util
 import logging
+import pkgutil
 import re
 import warnings
 from pathlib import Path
@@ -21,6 +23,76 @@ from jaxdyn.compile import expansion, jax_adapter, kernels, mode, target
 from jaxdyn.compile.executables import run_trial
 
 ADAPTER = Path(jax_adapter.__file__)
+
+
+def names_of_jax(tree: ast.Module) -> set[str]:
+    """Dotted names of JAX in a module: what it imports and the attributes of that."""
+    local, names = {}, set()
+    for node in ast.walk(tree):
+        for alias in node.names if isinstance(node, ast.Import | ast.ImportFrom) else ():
+            name = f"{node.module}.{alias.name}" if isinstance(node, ast.ImportFrom) else alias.name
+            names.add(name)
+            whole = alias.asname or isinstance(node, ast.ImportFrom)
+            local[alias.asname or alias.name.partition(".")[0]] = name if whole else name.partition(".")[0]
+    inner = {node.value for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and node not in inner:
+            head, _, rest = ast.unparse(node).partition(".")
+            names |= {f"{local[head]}.{rest}"} if head in local else set()
+    return {name for name in names if name.startswith(("jax.", "jaxlib"))}
+
+
+# --- names ---
+
+# Names of JAX that the adapter uses, by the page below https://docs.jax.dev/en/latest/ that documents them.
+DOCUMENTED = {
+    "changelog.html": "jax.__version__",
+    "config_options.html": "jax.config",
+    "jax-primitives.html": """
+        jax.core.ShapedArray jax.interpreters.ad jax.interpreters.ad.Zero
+        jax.interpreters.ad.is_undefined_primal jax.interpreters.ad.primitive_jvps
+        jax.interpreters.ad.primitive_transposes jax.interpreters.batching
+        jax.interpreters.batching.primitive_batchers jax.interpreters.mlir
+        jax.interpreters.mlir.register_lowering""",
+    "key-concepts.html": "jax.core.Tracer",
+    "jaxpr.html": "jax.core.eval_jaxpr",
+    "_autosummary/jax.devices.html": "jax.devices",
+    "_autosummary/jax.dtypes.float0.html": "jax.dtypes.float0",
+    "errors.html": "jax.errors.JaxRuntimeError",
+    "jax.experimental.serialize_executable.html": """
+        jax.experimental.serialize_executable jax.experimental.serialize_executable.deserialize_and_load
+        jax.experimental.serialize_executable.serialize""",
+    "jax.extend.core.html": "jax.extend.core.ClosedJaxpr jax.extend.core.Literal jax.extend.core.Primitive",
+    "jax.extend.mlir.html": "jax.extend.mlir.dialects.sdy",
+    "jax.ffi.html": "jax.ffi.ffi_lowering jax.ffi.pycapsule jax.ffi.register_ffi_target",
+    "ffi.html": "jax.ffi.include_dir",
+    "_autosummary/jax.jit.html": "jax.jit",
+    "jax.lax.html": "jax.lax",
+    "_autosummary/jax.lax.pcast.html": "jax.lax.pcast",
+    "jax.sharding.html": """
+        jax.sharding.AxisType jax.sharding.AxisType.Manual jax.sharding.NamedSharding
+        jax.sharding.PartitionSpec""",
+    "_autosummary/jax.typeof.html": "jax.typeof",
+}
+# Those that no page documents, with the reason to use them.
+UNDOCUMENTED = {
+    "jax.__version_info__": "numbers of __version__; equinox and flax read it too",
+    "jax.config.values": "all options; those in force are read as attributes, as the page says",
+    "jax.extend.mlir.dialects.sdy.DimMappingAttr.get": "Shardy's own Python bindings: openxla.org/shardy",
+    "jax.extend.mlir.dialects.sdy.OpShardingRuleAttr.get": "Shardy's own Python bindings: openxla.org/shardy",
+    "jax.extend.mlir.dialects.sdy.TensorMappingAttr.get": "Shardy's own Python bindings: openxla.org/shardy",
+    "jax.ffi.register_ffi_target_as_batch_partitionable": "its docstring: without it XLA gathers the batch around a call",
+    "jax.interpreters.mlir.ir_attribute": "attributes of a call; jax.ffi has no other way to hand over one of ours",
+    "jax.interpreters.mlir.lower_fun": "lowers by operations of JAX; in all extension libraries",
+}
+
+
+def test_each_name_that_the_adapter_uses_is_listed_with_its_documentation():
+    listed = {*" ".join(DOCUMENTED.values()).split(), *UNDOCUMENTED}
+    used = names_of_jax(ast.parse(ADAPTER.read_text(encoding="utf-8")))
+    assert used == listed, f"not listed: {used - listed}; not used: {listed - used}"
+    for name in listed:
+        pkgutil.resolve_name(name)
 
 
 # --- XLA's foreign function interface ---
