@@ -24,6 +24,7 @@ from jaxdyn.model.arguments import (
     Number,
     Numbers,
     SystemLike,
+    as_array,
     batch_hint,
     check_flag,
     check_new_name,
@@ -122,12 +123,13 @@ class Holonomic(Constraint):
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """phi(q, t), (n,)."""
         value = self.phi(system, q, t) if self.with_system else self.phi(q, t)
+        value = as_array(value, f"constraint {self.name!r}: the returned phi", q.dtype)
         # A matrix is most often a batch that was not mapped; its rows would be summed into wrong multipliers.
-        if jnp.ndim(value) > 1:
+        if value.ndim > 1:
             raise ValueError(
-                f"constraint {self.name!r}: phi returned shape {jnp.shape(value)}; return a vector (n,){batch_hint(value, (1,))}"
+                f"constraint {self.name!r}: phi returned shape {value.shape}; return a vector (n,){batch_hint(value, (1,))}"
             )
-        return jnp.atleast_1d(jnp.asarray(value, q.dtype))
+        return jnp.atleast_1d(value)
 
 
 class Pfaffian(Constraint):
@@ -165,7 +167,7 @@ class Pfaffian(Constraint):
         $$A v - b$$
         """
         place = (system, q, t) if self.with_system else (q, t)
-        rows = jnp.asarray(self.A(*place), q.dtype)
+        rows = as_array(self.A(*place), f"constraint {self.name!r}: the returned A", q.dtype)
         rows = rows[None] if rows.ndim == 1 else rows
         if rows.ndim != 2 or rows.shape[1] != v.shape[0]:
             raise ValueError(
@@ -174,7 +176,7 @@ class Pfaffian(Constraint):
         residual = matmul(rows, v)
         if self.b is None:
             return residual
-        b = jnp.atleast_1d(jnp.asarray(self.b(*place), q.dtype))
+        b = jnp.atleast_1d(as_array(self.b(*place), f"constraint {self.name!r}: the returned b", q.dtype))
         if b.shape != residual.shape:
             raise ValueError(
                 f"constraint {self.name!r}: b returned shape {b.shape}, expected {residual.shape} as A has rows"

@@ -112,7 +112,7 @@ class HeightField(Surface):
     def height(self, xy: Float[Array, "2"]) -> Float[Array, ""]:
         """Height f(x, y), m."""
         if self.coefficients is None:
-            value = jnp.asarray(self.f(xy), xy.dtype)
+            value = as_array(self.f(xy), "HeightField: heights", xy.dtype)
             if value.shape != ():
                 raise ValueError(f"HeightField: heights returned shape {value.shape}; return one number (m), ()")
             return value

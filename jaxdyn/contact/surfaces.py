@@ -25,7 +25,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, as_float, as_number, check_flag
+from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, as_float, as_number, check_flag
 from jaxdyn.systems.scene import as_pytree
 
 
@@ -240,7 +240,7 @@ class Parametrised(Surface):
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
         """Point f(alpha), m, with u and v exchanged for `flip`."""
         # Exchanging the coordinates reverses f_u x f_v.
-        value = jnp.asarray(self.f(alpha[::-1] if self.flip else alpha), alpha.dtype)
+        value = as_array(self.f(alpha[::-1] if self.flip else alpha), "surface: f", alpha.dtype)
         if value.shape != (3,):
             raise ValueError(f"surface: f returned shape {value.shape}, expected (3,), a point")
         return value

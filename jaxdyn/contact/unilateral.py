@@ -281,7 +281,7 @@ class _Gap(Constraint):
         return ()
 
     def position(self, system, q, t):
-        gap = jnp.asarray(self.gap(q, t), q.dtype)
+        gap = as_array(self.gap(q, t), f"contact {self.name!r}: gap", q.dtype)
         if gap.shape != ():
             raise ValueError(f"contact {self.name!r}: gap returned shape {gap.shape}; return one number (m), ()")
         return gap[None]

@@ -156,7 +156,7 @@ class CenterError(Constraint):
 
 
 def _task_error(value, target, t, like) -> Float[Array, " m"]:
-    value = jnp.asarray(value, like.dtype)
+    value = as_array(value, "task", like.dtype)
     if value.ndim != 1:
         raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
     return value - target_value(target, t, value.shape, like)

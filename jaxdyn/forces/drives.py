@@ -22,6 +22,7 @@ from jaxdyn.model.arguments import (
     Number,
     Numbers,
     SystemLike,
+    as_array,
     as_float,
     check_name,
     check_names,
@@ -310,7 +311,7 @@ class RayleighDissipation(eqx.Module):
             if jnp.shape(R) != ():
                 raise ValueError(f"RayleighDissipation: function returned shape {jnp.shape(R)}; return one number, ()")
             # The function may return a Python integer, which `jax.grad` refuses.
-            return jnp.asarray(R, v.dtype)
+            return as_array(R, "RayleighDissipation: function", v.dtype)
 
         return -jax.grad(value)(v)
 

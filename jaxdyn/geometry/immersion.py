@@ -24,7 +24,7 @@ from jaxdyn.compile.known import is_known
 from jaxdyn.dynamics import centroidal
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, as_float, check_count, check_flag, check_state
+from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, as_float, check_count, check_flag, check_state
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
 from jaxdyn.systems.system import SceneLike, System, describe_state, rate_to_velocity
 
@@ -37,8 +37,8 @@ class PullBack(eqx.Module):
 
     def __call__(self, s: Float[Array, " m"]) -> Array:
         """The tensor at s: every index of the field's contracted with J = dxi/ds."""
-        q = self.immersion(s)
-        value = jnp.asarray(self.field(q), s.dtype)
+        q = as_array(self.immersion(s), "immersion", s.dtype)
+        value = as_array(self.field(q), "field", s.dtype)
         if any(size != q.shape[0] for size in value.shape):
             raise ValueError(
                 f"field returned shape {value.shape}, expected ({q.shape[0]}, ...) with q = xi(s) {q.shape}"

@@ -270,7 +270,7 @@ def _as_function(metric, t: Numbers = 0.0) -> Callable:
                 f"metric returned shape {jnp.shape(g)}, expected {(q.shape[0], q.shape[0])} for this q{batch_hint(g, (1, 1))}"
             )
         # A metric of constants in float64 would promote a float32 q.
-        return jnp.asarray(g, q.dtype)
+        return as_array(g, "metric", q.dtype)
 
     return evaluate
 

@@ -15,13 +15,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point, gram_eigenvectors
-from jaxdyn.compile.known import is_known
+from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import REGULAR, RESIDUAL, condition_number, eps_of, pseudo_inverse, rank_of, tolerance
 from jaxdyn.constraints.redundancy import sign_of_determinant
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, as_shape, check_state
+from jaxdyn.model.arguments import Number, Numbers, as_array, as_shape, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
@@ -76,6 +76,16 @@ class Independent(Basis):
 
     velocities: tuple[int, ...] = eqx.field(static=True)
 
+    @staticmethod
+    def of(indices: Sequence[int], scene: Scene, name: str) -> "Independent":
+        """Basis of some velocities. **Raises:** ValueError for invalid indices, and for all velocities."""
+        are_indices = all(isinstance(i, int) and not isinstance(i, bool) and 0 <= i < scene.nv for i in indices)
+        if not indices or not are_indices or len(set(indices)) < len(indices):
+            raise ValueError(f"{name} is {indices}; give different indices of velocities, each 0 to {scene.nv - 1}")
+        if len(indices) == scene.nv:
+            raise ValueError(f"{name} is {indices}, all velocities; leave out those that the constraints determine")
+        return Independent(tuple(indices))
+
     def size(self, scene):
         """Number of independent velocities."""
         return len(self.velocities)
@@ -114,13 +124,13 @@ class UserBasis(Basis):
         """Parametrisation by the function's N and v0, with its quality."""
         A, b = _affine_rows(scene, q, t)
         value = self.function(q, t)
-        N, v0 = value if isinstance(value, tuple) else (value, None)
-        N = jnp.asarray(N, q.dtype)
+        N, v0 = value if isinstance(value, tuple) and len(value) == 2 else (value, None)
+        N = as_array(N, "basis: the returned N", q.dtype)
         if N.ndim != 2 or N.shape[0] != scene.nv:
             raise ValueError(f"basis returned shape {N.shape}; return N with shape ({scene.nv}, nr) = (nv, nr)")
         inverse = pseudo_inverse(A, tolerance(None, A))
         # The shortest v0 with A v0 = b, also for dependent rows.
-        v0 = matmul(inverse, b) if v0 is None else jnp.asarray(v0, q.dtype)
+        v0 = matmul(inverse, b) if v0 is None else as_array(v0, "basis: the returned v0", q.dtype)
         if v0.shape != (scene.nv,):
             raise ValueError(f"basis returned v0 with shape {v0.shape}, expected {(scene.nv,)} = (nv,)")
         # Columns are scaled to unit length, so that the quality does not depend on the units of nu.
@@ -238,12 +248,10 @@ def as_basis(basis: BasisLike | None, scene: Scene) -> Basis:
     if isinstance(basis, Basis):
         return basis
     if callable(basis):
-        return UserBasis(as_pytree(basis, "basis"))
+        return UserBasis(as_pytree(basis, "basis", "q, t"))
     # True is an int in Python, and would be an index.
     if isinstance(basis, (tuple, list)) and all(isinstance(i, int) and not isinstance(i, bool) for i in basis):
-        if not basis or len(set(basis)) < len(basis) or not all(0 <= i < scene.nv for i in basis):
-            raise ValueError(f"basis is {basis}; give different indices of velocities, each 0 to {scene.nv - 1}")
-        return Independent(tuple(basis))
+        return Independent.of(basis, scene, "basis")
     if not isinstance(basis, (np.ndarray, jax.Array)):
         raise ValueError(
             f"basis is {basis!r}; give a tuple of indices of independent velocities, a function N(q, t) -> (nv, nr), "
@@ -252,7 +260,7 @@ def as_basis(basis: BasisLike | None, scene: Scene) -> Basis:
     if basis.ndim != 2 or basis.shape[0] != scene.nv or not 0 < basis.shape[1] <= scene.nv:
         raise ValueError(f"basis has shape {basis.shape}, expected ({scene.nv}, nr) = (nv, nr)")
     # A matrix is a reference and need not be tangent: `Orthonormal` projects it.
-    return Orthonormal(jnp.asarray(basis))
+    return Orthonormal(jnp.asarray(as_array(basis, "basis")))
 
 
 COLUMNS = " as the basis has columns"  # of nu, in messages
@@ -277,20 +285,28 @@ def tangent_basis(
     **Arguments:** `q` (nq,); `t`, s; `dof`: nr, by default nv minus the rank of A on concrete numbers and minus the number
     of rows on traced ones; `rank_tol` as in `constrained_dynamics`.
 
-    **Returns:** (nv, nr); NaN on traced numbers without `dof` where the rows are dependent, and where the rank is not clear.
+    **Returns:** (nv, nr); NaN on traced numbers where the rank of A is not nv - nr, and where it is not clear.
 
-    **Raises:** ValueError when no degree of freedom remains, when `dof` is required, and for a rank that is not clear.
+    **Raises:** ValueError when no degree of freedom remains, when `dof` is required or is not nv minus the rank, and for a rank
+    that is not clear.
     """
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so every velocity is tangent; add some")
-    scene, counts = independent_rows(scene, q, t, rank_tol), dof is None
+    scene = independent_rows(scene, q, t, rank_tol)
     dof = count_dof(scene, q, t, dof, rank_tol)
     projector, rank = _tangent_projection(scene, q, t, rank_tol)
     basis = split_directions(projector)[:, scene.nv - dof :]
-    # The number of columns is a shape. Where it is that of all rows, the decision on those that count has to confirm it.
-    return jnp.where(rank == scene.nv - dof, basis, jnp.nan) if counts else basis
+    # The number of columns is a shape, which the rank has to confirm: another one would leave a direction out, or break a row.
+    agrees = rank == scene.nv - dof
+    if is_concrete(agrees) and not bool(agrees):
+        # Raises by itself where the rank is not clear.
+        remaining = count_dof(scene, q, t, None, rank_tol)
+        raise ValueError(
+            f"dof is {dof}, but the rows leave {remaining} of nv = {scene.nv} velocities here; leave dof out"
+        )
+    return jnp.where(agrees, basis, jnp.nan)
 
 
 def count_dof(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None = None) -> int:
@@ -362,7 +378,9 @@ def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Floa
     # Cholesky and not QR: no choice of signs, so that the result is smooth in X.
     factor = cholesky(matmul(columns.T, columns))
     pivots = jnp.diagonal(factor)
-    return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots), factor
+    # No columns are independent.
+    quality = jnp.min(pivots) / jnp.max(pivots) if pivots.size else jnp.ones((), columns.dtype)
+    return solve_lower(factor, columns.T).T, quality, factor
 
 
 def min_quality(dtype) -> float:

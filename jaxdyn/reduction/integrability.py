@@ -20,7 +20,6 @@ from jaxdyn.model.arguments import Numbers, as_shape, check_state, zeros_if_none
 from jaxdyn.reduction.bases import (
     Independent,
     Orthonormal,
-    as_basis,
     constraint_jacobian_compiled,
     pivot_rows,
     tangent_basis,
@@ -192,9 +191,9 @@ def spurious_terms(
         raise ValueError("the scene has no constraints, so there is nothing to substitute; add some")
     if scene.nq != scene.nv:
         raise ValueError(f"the system has nq = {scene.nq}, nv = {scene.nv}; substitution needs v = dq/dt")
-    choice = as_basis(tuple(independent) if isinstance(independent, Sequence) else independent, scene)
-    if not isinstance(choice, Independent):
+    if not isinstance(independent, Sequence) or isinstance(independent, str):
         raise ValueError(f"independent is {independent!r}; give a tuple of indices of velocities")
+    choice = Independent.of(independent, scene, "independent")
     nu = as_shape(nu, "nu", q.dtype, (choice.size(scene),), of=" = (nr,)")
     terms, depends = _substitute(independent_rows(scene, q, t), choice, q, nu, tau, t)
     if is_concrete(depends) and float(depends) > 1e-9:

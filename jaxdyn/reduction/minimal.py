@@ -21,7 +21,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.dynamics import total_force
-from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.rank import RESIDUAL, eps_of, pseudo_inverse, rank_of, tolerance
 from jaxdyn.constraints.redundancy import distribute_multipliers
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, inverse_dynamics, mass_matrix
@@ -224,11 +224,13 @@ def gauge_invariant(
       V2 is rotated by it. Neither changes the motion.
     - `dof`, `rank_tol` as in `tangent_basis`.
 
-    **Returns:** `GaugeInvariantDynamics`. Where the rank of A is not nv - nr the result is `singular_basis`.
+    **Returns:** `GaugeInvariantDynamics`. Where the rank of A is not nv - nr, or a rotation is not orthogonal, the result is
+    `singular_basis`.
 
     Derivatives are exact where the rank is constant; V1 and V2 are parallel-transported.
 
-    **Raises:** ValueError for a scene without constraints, inconsistent shapes, and no degree of freedom.
+    **Raises:** ValueError for a scene without constraints, inconsistent shapes, known rotations that are not orthogonal, and no
+    degree of freedom.
 
     Source: EQUATIONS section 9.
     """
@@ -243,7 +245,18 @@ def gauge_invariant(
         None if value is None else as_float(value, name, (size, size), q.dtype)
         for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof))
     )
+    for name, value in (("rotation", rotation), ("motion_rotation", motion_rotation)):
+        if value is not None and is_concrete(value) and not bool(_is_orthogonal(value)):
+            raise ValueError(
+                f"{name} is {value.tolist()}, which is not orthogonal; give Q with Q^T Q = 1, as from jnp.linalg.qr"
+            )
     return _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
+
+
+def _is_orthogonal(rotation: Float[Array, "n n"]):
+    """Whether a matrix is orthogonal to the rounding error of its construction."""
+    off = matmul(rotation.T, rotation) - jnp.eye(rotation.shape[0], dtype=rotation.dtype)
+    return jnp.max(jnp.abs(off)) <= eps_of(rotation) ** RESIDUAL
 
 
 def quasi_connection(
@@ -361,7 +374,10 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     change = matmul(null_projector, free) + matmul(back, wanted)
     rank = rank_of(Lambda, back)
     # The bases have a static number of columns, which is valid for this rank alone.
-    result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)
+    is_valid = rank == scene.nv - dof
+    for given in (rotation, motion_rotation):
+        is_valid = is_valid if given is None else is_valid & _is_orthogonal(given)
+    result = RESULTS.where(is_valid, RESULTS.successful, RESULTS.singular_basis)
     result = rank_code(scene, result)
     a = matmul(inverse.T, change - matmul(Wdot.T, v))
     return GaugeInvariantDynamics(

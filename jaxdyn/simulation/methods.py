@@ -250,7 +250,7 @@ class Reduced(Method):
             raise ValueError(
                 f"basis is {basis!r}; give indices of independent velocities, a function N(q, t), a reference matrix, or None"
             )
-        self.basis = UserBasis(as_pytree(basis, "basis")) if is_function else basis
+        self.basis = UserBasis(as_pytree(basis, "basis", "q, t")) if is_function else basis
         self.dof = dof if dof is None else check_count(dof, "dof")
 
     def for_scene(self, scene: Scene, dof: int | None) -> "Reduced":

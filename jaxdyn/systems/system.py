@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_known
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Number, batch_hint, check_count
+from jaxdyn.model.arguments import Checked, Function, Number, as_array, batch_hint, check_count
 from jaxdyn.model.configuration import configuration_rate, difference, integrate, joint_rates, normalize
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
@@ -307,7 +307,7 @@ def evaluate_callback(function, shape, name, state, t, parameters):
         raise ValueError(
             f"{name} returned shape {jnp.shape(value)}{';' if shape == () else ','} {wanted}{batch_hint(value, shape)}"
         )
-    return jnp.asarray(value, state[0].dtype)
+    return as_array(value, name, state[0].dtype)
 
 
 _mass_matrix_compiled = eqx.filter_jit(lambda system, q, t: system.mass_matrix(q, t))

@@ -88,7 +88,7 @@ TAKES = [
     *((name, CHAIN, *call) for name, call in OF_SCENES.items()),
 ]
 # Arguments that select a program: names, kinds and tolerances.
-ONES = jnp.ones(3)
+ONES, Q2 = jnp.ones(3), jnp.ones(2)
 ARRAYS_FOR_STATIC = {
     "tip": lambda x: jd.newton_euler_matrices(ARM, jnp.zeros(2), jnp.zeros(2), tip=x),
     "frame": lambda x: jd.frame_jacobian(ARM, jnp.zeros(2), x),
@@ -457,6 +457,28 @@ def hybrid(task, of="position", target=(0.0,), **options):
 
 def _raises(q, v, t):
     raise KeyError("of the law")
+
+
+RETURNS = {
+    "constraint 'own': the returned phi": lambda f: jd.Holonomic(lambda q, t: f(q), name="own").position(ARM, Q2, 0.0),
+    "constraint 'own': the returned A": lambda f: jd.Pfaffian(lambda q, t: f(q), name="own").velocity(ARM, Q2, Q2, 0.0),
+    "constraint 'own': the returned b": lambda f: jd.Pfaffian(
+        lambda q, t: q, lambda q, t: f(q)[:1], name="own"
+    ).velocity(ARM, Q2, Q2, 0.0),
+    "bias_force": lambda f: jd.bias_force(jd.ExplicitSystem(lambda q: jnp.eye(2), lambda q, v: f(q), 2), Q2, Q2),
+    "metric": lambda f: jd.geometry.flat(lambda q: f(jnp.eye(2)), Q2, Q2),
+    "field": lambda f: jd.geometry.pull_back(f, lambda s: s)(Q2),
+    "immersion": lambda f: jd.geometry.pull_back(lambda q: q, f)(Q2),
+    "surface: f": lambda f: jd.contact.Parametrised(lambda a: f(jnp.ones(3))).point(Q2),
+    "RayleighDissipation: function": lambda f: jd.forces.RayleighDissipation(lambda q, v, t: f(v)[0])(ARM, Q2, Q2, 0.0),
+}
+
+
+@pytest.mark.parametrize(("name", "call"), RETURNS.items())
+def test_complex_results_of_functions_are_refused(name, call):
+    """A cast to real numbers dropped the imaginary part without a word."""
+    with pytest.raises(ValueError, match=f"^{name} is complex"):
+        call(lambda x: x.astype(complex))
 
 
 @pytest.mark.parametrize("way", ["simulate", "stepper"])

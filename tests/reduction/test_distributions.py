@@ -183,6 +183,8 @@ def test_spurious_terms_refuse():
         jd.reduction.spurious_terms(scene, jnp.asarray([0.2, -0.1, 0.5]), jnp.ones(2), independent=(0, 1))
     with pytest.raises(ValueError, match=r"nu has shape \(1,\), expected \(2,\)"):
         jd.reduction.spurious_terms(scene, jnp.zeros(3), jnp.ones(1), independent=(0, 2))
+    with pytest.raises(ValueError, match=r"independent is \(0, 9\); give different indices"):
+        jd.reduction.spurious_terms(scene, jnp.zeros(3), jnp.ones(2), independent=(0, 9))
     with pytest.raises(ValueError, match="nq = 7, nv = 6"):
         jd.reduction.spurious_terms(
             scenes.rolling_coin(), scenes.rolling_coin.start()[0], jnp.ones(3), independent=(0, 1, 2)

@@ -134,6 +134,24 @@ def test_the_motion_does_not_depend_on_the_gauge(state):
     assert_close(back, x.reduced_acceleration, 1e-12)
 
 
+def test_a_gauge_is_orthogonal(state):
+    """The equations hold for orthogonal rotations alone: another matrix is refused, or gets a code where it is traced."""
+    q, v, tau = state
+    scene = jd.Scene(jd.LagrangianSystem(coupled, 4), (jd.Pfaffian(two_rows),))
+    free = lambda turn, motion: jd.reduction.gauge_invariant(  # noqa: E731
+        scene, q, v, tau, rotation=turn, motion_rotation=motion, dof=2
+    )
+    for name, turn, motion in (("rotation", jnp.ones((4, 4)), None), ("motion_rotation", None, 2 * jnp.eye(2))):
+        with pytest.raises(ValueError, match=f"^{name} is .* not orthogonal"):
+            free(turn, motion)
+    traced = quick(jax.vmap(lambda turn, motion: free(turn, motion).result == jd.RESULTS.singular_basis))
+    good, small = turned(4), turned(2)
+    wrong = traced(jnp.stack([good, 1.1 * good, good]), jnp.stack([small, small, small.at[0].mul(2.0)]))
+    assert wrong.tolist() == [False, True, True]
+    # Two rows leave two velocities, not four.
+    assert bool(jd.reduction.gauge_invariant(scene, q, v, tau, dof=4).result == jd.RESULTS.singular_basis)
+
+
 @pytest.mark.slow
 def test_bodies_with_dependent_rows():
     """A pendulum with its rod listed three times; the sleigh, a body whose velocity is not dq/dt. Eager calls."""

@@ -235,6 +235,7 @@ def test_bad_arguments():
         "qr": "tuple of indices",
         None: "tuple of indices",
         (0, 1, 2): r"nu has shape \(2,\), expected \(3,\)",
+        (0, 1, 2, 3): r"basis is \(0, 1, 2, 3\), all velocities; leave out those",
     }
     for basis, message in bad.items():
         with pytest.raises(ValueError, match=message):
@@ -243,6 +244,20 @@ def test_bad_arguments():
         jd.reduced_dynamics(scene, q, v[2:], basis=jnp.ones((3, 2)))
     with pytest.raises(ValueError, match=r"basis returned shape \(2,\)"):
         jd.reduced_dynamics(scene, q, v[2:], basis=lambda q, t: q[:2])
+    functions = (
+        (lambda q: disk_basis(q, 0.0), r"basis takes \(q\), but is called as \(q, t\)"),
+        (lambda q, t: None, "basis: the returned N is"),
+        (lambda q, t: disk_basis(q, t).astype(complex), "basis: the returned N is complex"),
+        (lambda q, t: (disk_basis(q, t), q.astype(complex)), "basis: the returned v0 is complex"),
+        (lambda q, t: (disk_basis(q, t),), r"basis returned shape \(1, 4, 2\)"),
+    )
+    for function, message in functions:
+        with pytest.raises(ValueError, match=message):
+            jd.reduced_dynamics(scene, q, v[2:], basis=function)
+    with pytest.raises(ValueError, match="basis is complex"):
+        jd.reduced_dynamics(scene, q, v[2:], basis=disk_basis(q, 0.0).astype(complex))
+    with pytest.raises(ValueError, match=r"basis takes \(q\), but is called as \(q, t\)"):
+        jd.Reduced(lambda q: disk_basis(q, 0.0))
     with pytest.raises(ValueError, match="no constraints"):
         jd.reduced_dynamics(jd.Scene(scene.system), q, v, basis=(0,))
     twice, q = scenes.pendulum_in_plane(), jnp.asarray([0.6, -0.8])
@@ -250,6 +265,10 @@ def test_bad_arguments():
     assert jd.reduction.tangent_basis(twice, q).shape == (2, 1)
     with pytest.raises(ValueError, match="give dof"):
         jax.jit(lambda q: jd.reduction.tangent_basis(twice, q))(q)
+    # One velocity is tangent to the circle: two columns would break the row.
+    with pytest.raises(ValueError, match="dof is 2, but the rows leave 1 of nv = 2"):
+        jd.reduction.tangent_basis(twice, q, dof=2)
+    assert np.isnan(quick(lambda q: jd.reduction.tangent_basis(twice, q, dof=2))(q)).all()
 
 
 @pytest.mark.slow
