@@ -307,11 +307,11 @@ class RayleighDissipation(eqx.Module):
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         def value(v):
-            R = self.function(q, v, t)
-            if jnp.shape(R) != ():
-                raise ValueError(f"RayleighDissipation: function returned shape {jnp.shape(R)}; return one number, ()")
             # The function may return a Python integer, which `jax.grad` refuses.
-            return as_array(R, "RayleighDissipation: function", v.dtype)
+            R = as_array(self.function(q, v, t), "RayleighDissipation: function", v.dtype)
+            if R.shape != ():
+                raise ValueError(f"RayleighDissipation: function returned shape {R.shape}; return one number, ()")
+            return R
 
         return -jax.grad(value)(v)
 
@@ -404,7 +404,7 @@ class SlidingFriction(PiecewiseForce):
 
     def _row(self, q, v, t):
         row: Any = self.along.row(v) if isinstance(self.along, _Coordinate) else self.along(q, t)
-        return jnp.asarray(row, v.dtype)
+        return as_array(row, "SlidingFriction: along", v.dtype)
 
 
 # A Module and not an array: the number of velocities is known only with the system.

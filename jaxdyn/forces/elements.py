@@ -20,6 +20,7 @@ from jaxdyn.model.arguments import (
     Number,
     Numbers,
     SystemLike,
+    as_array,
     as_float,
     batch_hint,
     check_names,
@@ -373,10 +374,11 @@ def sum_wrenches(
     total = jnp.zeros((model.nb, 6), q.dtype)
     for frame, wrench in wrenches.items():
         body, offset = named_frame(model, frame)
-        if jnp.shape(wrench) != (6,):
-            raise ValueError(f"{what} gives shape {jnp.shape(wrench)} for frame {frame!r}, expected (6,)")
+        wrench = as_array(wrench, what, q.dtype)
+        if wrench.shape != (6,):
+            raise ValueError(f"{what} gives shape {wrench.shape} for frame {frame!r}, expected (6,)")
         # A frame on the ground moves no body.
         if body >= 0 and counts(frame):
-            at_body = se3.Ad_inv_T_apply(jnp.asarray(offset, q.dtype), jnp.asarray(wrench, q.dtype))
+            at_body = se3.Ad_inv_T_apply(jnp.asarray(offset, q.dtype), wrench)
             total = total.at[body].add(at_body)
     return total

@@ -39,10 +39,8 @@ class PullBack(eqx.Module):
         """The tensor at s: every index of the field's contracted with J = dxi/ds."""
         q = as_array(self.immersion(s), "immersion", s.dtype)
         value = as_array(self.field(q), "field", s.dtype)
-        if any(size != q.shape[0] for size in value.shape):
-            raise ValueError(
-                f"field returned shape {value.shape}, expected ({q.shape[0]}, ...) with q = xi(s) {q.shape}"
-            )
+        if q.ndim != 1 or any(size != q.size for size in value.shape):
+            raise ValueError(f"field returned shape {value.shape}, expected ({q.size}, ...) with q = xi(s) {q.shape}")
         # Forward mode: an immersion has fewer inputs than outputs, m < n.
         J = jax.jacfwd(self.immersion)(s)
         # Under tracing the rank is unknown; concrete calls refuse singular points.
@@ -96,14 +94,15 @@ class ImmersedSystem(System):
         """Configuration of each unit at s, each (nq,) of its system."""
         positions = self.immersion(s, t) if self.moving else self.immersion(s)
         positions = tuple(positions) if self.joined else (positions,)
-        sizes = [jnp.shape(q) for q in positions]
+        positions = tuple(as_array(q, "xi", s.dtype) for q in positions)
+        sizes = [q.shape for q in positions]
         wanted = [(unit.nq,) for unit in self.units]
         if sizes != wanted:
             raise ValueError(
                 f"xi returned shapes {sizes}, expected {wanted}: "
                 + ("one configuration for each of the systems" if self.joined else "the system's configuration")
             )
-        return tuple(jnp.asarray(q, s.dtype) for q in positions)
+        return positions
 
     def velocities(self, s, v, t) -> tuple[Array, ...]:
         """Velocity of each unit at s and sdot = v, each (nv,) of its system."""

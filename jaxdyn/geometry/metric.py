@@ -264,13 +264,13 @@ def _as_function(metric, t: Numbers = 0.0) -> Callable:
     given: Callable = metric
 
     def evaluate(q):
-        g = given(q)
-        if jnp.shape(g) != (q.shape[0], q.shape[0]):
-            raise ValueError(
-                f"metric returned shape {jnp.shape(g)}, expected {(q.shape[0], q.shape[0])} for this q{batch_hint(g, (1, 1))}"
-            )
         # A metric of constants in float64 would promote a float32 q.
-        return as_array(g, "metric", q.dtype)
+        g = as_array(given(q), "metric", q.dtype)
+        if g.shape != (q.shape[0], q.shape[0]):
+            raise ValueError(
+                f"metric returned shape {g.shape}, expected {(q.shape[0], q.shape[0])} for this q{batch_hint(g, (1, 1))}"
+            )
+        return g
 
     return evaluate
 

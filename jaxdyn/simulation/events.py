@@ -114,10 +114,10 @@ class Terminal(eqx.Module):
 
     def margin(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
         """Value of the function, (), in the dtype of q. **Raises:** ValueError where it is not one number."""
-        value = self.function(q, v, t)
-        if jnp.shape(value) != ():
-            raise ValueError(f"Terminal: function returned shape {jnp.shape(value)}; return one number, ()")
-        if jnp.issubdtype(jnp.result_type(value), jnp.bool_):
+        value = as_array(self.function(q, v, t), "Terminal: function")
+        if value.shape != ():
+            raise ValueError(f"Terminal: function returned shape {value.shape}; return one number, ()")
+        if value.dtype == bool:
             raise ValueError("Terminal: function returned a bool, which cannot fall below zero; return a difference")
         return as_array(value, "Terminal: function", q.dtype)
 

@@ -267,10 +267,11 @@ def as_scene(scene: Any) -> Scene:
 
 def check_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Float[Array, " nv"]:
     """Check that the result of a force or control callback is (nv,), and convert it to the dtype of q."""
-    if jnp.shape(value) != (nv,):
-        hint = batch_hint(value, (nv,))
-        raise ValueError(f"{argument} returned shape {jnp.shape(value)}, expected {(nv,)} = (nv,){hint}")
-    return as_array(value, argument, q.dtype)
+    # A list of traced numbers is an array too.
+    value = as_array(value, argument, q.dtype)
+    if value.shape != (nv,):
+        raise ValueError(f"{argument} returned shape {value.shape}, expected {(nv,)} = (nv,){batch_hint(value, (nv,))}")
+    return value
 
 
 def _check_call(function: Any, name: str, call: str, args: Sequence[Any]) -> None:

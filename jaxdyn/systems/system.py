@@ -301,13 +301,14 @@ def symbols(derivative: Float[Array, "n n n"]) -> Float[Array, "n n n"]:
 def evaluate_callback(function, shape, name, state, t, parameters):
     """Evaluate a user's function of the state, or of (state, t, parameters) when there are parameters."""
     value = function(*state) if parameters is None else function(*state, t, parameters)
-    if jnp.shape(value) != shape:
+    value = as_array(value, name, state[0].dtype)
+    if value.shape != shape:
         size = state[0].shape[0]
         wanted = "return one number, ()" if shape == () else f"expected {shape} for nq = {size}"
         raise ValueError(
-            f"{name} returned shape {jnp.shape(value)}{';' if shape == () else ','} {wanted}{batch_hint(value, shape)}"
+            f"{name} returned shape {value.shape}{';' if shape == () else ','} {wanted}{batch_hint(value, shape)}"
         )
-    return as_array(value, name, state[0].dtype)
+    return value
 
 
 _mass_matrix_compiled = eqx.filter_jit(lambda system, q, t: system.mass_matrix(q, t))

@@ -481,6 +481,17 @@ def test_complex_results_of_functions_are_refused(name, call):
         call(lambda x: x.astype(complex))
 
 
+def test_functions_may_return_lists_of_numbers():
+    """Within a trace they ended in JAX's error on arrays of numpy."""
+    zero = jnp.zeros(2)
+    spring = lambda system, q, v, t: [-q[0], -2.0 * q[1]]  # noqa: E731
+    held = jd.ExplicitSystem(lambda q: [[2.0 + q[0], 0.0], [0.0, 4.0]], lambda q, v: [q[0], q[1]], 2)
+    same(jax.jit(lambda q: jd.forward_dynamics(held, q, zero, zero))(Q2), -Q2 / jnp.asarray([3.0, 4.0]))
+    pulled = jd.constrained_dynamics(jd.Scene(held, forces=[spring]), Q2, zero).acceleration
+    same(pulled, jnp.asarray([-2.0 / 3.0, -0.75]))
+    same(jd.geometry.flat(lambda q: [[q[0], 0.0], [0.0, q[1]]], Q2, 3 * Q2), 3 * Q2)
+
+
 @pytest.mark.parametrize("way", ["simulate", "stepper"])
 def test_an_error_inside_a_traced_law_is_told_in_few_lines(way):
     """Under jit, vmap and grad the user reads the frames of his own code and of the library, and no program of JAX."""
