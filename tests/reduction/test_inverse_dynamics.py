@@ -244,3 +244,20 @@ def test_velocities_that_nothing_drives_move_as_forces_make_them():
     assert_close(jd.forward_dynamics(model, q, v, inverse.tau), inverse.acceleration, 1e-12)
     assert_close(inverse.acceleration[1], 1.5, 1e-12)
     assert float(inverse.tau[0]) == 0.0
+
+
+def test_torques_near_a_dead_centre_lose_only_the_digits_of_the_motion():
+    """A particle on a circle, pushed along x where x hardly moves: m (theta'' + g cos(theta)) = -F sin(theta)."""
+    mass, gravity, rate, angular = 1.7, 9.81, 0.8, 0.25
+    particle = jd.ExplicitSystem(lambda q: mass * jnp.eye(2), lambda q, v: jnp.stack([0 * q[0], mass * gravity]), 2)
+    scene = jd.Scene(particle, [jd.Holonomic(lambda q, t: 0.5 * (q @ q - 1.0))])
+    solve = quick(
+        jax.vmap(lambda q, v, a: jd.constrained_inverse_dynamics(scene, q, v, a[None], motors=[0], independent=[0]))
+    )
+    angles = 10.0 ** -np.arange(1, 7)
+    sin, cos = np.sin(angles), np.cos(angles)
+    motion = solve(np.stack([cos, sin], 1), rate * np.stack([-sin, cos], 1), -sin * angular - cos * rate**2)
+    assert (motion.result == jd.RESULTS.successful).all()
+    wanted = mass * (angular + gravity * cos) / -sin
+    # theta'' follows from x'' = -sin(theta) theta'' - ..., whose rounding it divides by sin(theta).
+    assert (np.abs(motion.torques[:, 0] / wanted - 1) < 10 * np.finfo(float).eps / sin).all()
