@@ -10,6 +10,7 @@ from test_control import KD, KP, assert_decays, decayed
 
 import jaxdyn as jd
 from jaxdyn import scenes
+from jaxdyn.control.errors import hierarchical_acceleration
 
 TS = jnp.linspace(0.0, 2.0, 21)
 PRESS = jnp.asarray([2.0])
@@ -401,3 +402,19 @@ def test_bad_input_is_refused(pendulum, build, message):
 
 def _state(scene):
     return jnp.asarray([0.6, 0.0, -0.8]), jnp.zeros(3), 0.0
+
+
+@pytest.mark.parametrize("angle", [1e-2, 1e-4, 1e-6])
+def test_a_task_that_nearly_depends_on_a_constraint_leaves_it_alone(angle):
+    """Both rows hold to the rounding of the acceleration that they need, which grows as the inverse of the angle."""
+    rng = np.random.default_rng(2)
+    root, (first, change), start = rng.normal(size=(4, 4)), rng.normal(size=(2, 4)), rng.normal(size=4)
+    inertia = jnp.asarray(root @ root.T + 4 * np.eye(4))
+    system = jd.ExplicitSystem(lambda q: inertia, lambda q, v: 0 * q, 4)
+    rows, wanted = np.stack([first, first + angle * change]), np.array([0.7, -0.4])
+    orders = [(jnp.asarray(rows[i : i + 1]), jnp.asarray(wanted[i : i + 1])) for i in (0, 1)]
+    a = np.asarray(hierarchical_acceleration(system, jnp.zeros(4), 0.0, orders, jnp.asarray(start)))
+    assert np.abs(a).max() > 0.1 / angle
+    assert (
+        np.abs(rows @ a - wanted) < 100 * np.finfo(float).eps * np.linalg.norm(rows, axis=1) * np.linalg.norm(a)
+    ).all()
