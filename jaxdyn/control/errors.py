@@ -217,8 +217,8 @@ def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"
     for A, wanted in orders:
         Y = metric.whiten(A.T)
         # Rows spanned by those of higher priority leave rounding errors, which must not count as directions.
-        # The second projection removes what rounding of the first leaves along rows of higher priority, which is large beside a
-        # row that nearly depends on them and would disturb these.
+        # The second projection removes what rounding of the first leaves along rows of higher priority. Without it a row that
+        # nearly depends on these would disturb them.
         left = drop_rounding(matmul(free, matmul(free, Y)), Y)
         inverse = pseudo_inverse(left, tolerance(None, left)).T
         # Rows of lower priority correct what those above them have left, within the null space of these.

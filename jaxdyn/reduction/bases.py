@@ -301,7 +301,7 @@ def tangent_basis(
     # The number of columns is a shape, which the rank has to confirm: another one would leave a direction out, or break a row.
     agrees = rank == scene.nv - dof
     if is_concrete(agrees) and not bool(agrees):
-        # Raises by itself where the rank is not clear.
+        # This raises where the rank is not clear.
         remaining = count_dof(scene, q, t, None, rank_tol)
         raise ValueError(
             f"dof is {dof}, but the rows leave {remaining} of nv = {scene.nv} velocities here; leave dof out"

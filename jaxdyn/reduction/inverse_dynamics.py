@@ -212,8 +212,8 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
 
     Z = metric.whiten(jnp.asarray(E.T))
     # A velocity that the rows hold, as at a dead centre, leaves rounding here, which is large beside nothing else.
-    # The second K removes the constraint forces that rounding of the first leaves. Near a dead centre they are large beside what
-    # is driven, and torques lost twice as many digits as the motion.
+    # The second K removes the constraint forces that rounding of the first leaves. Near a dead centre, where little is driven,
+    # torques would lose twice as many digits as the motion.
     squares, driven = jnp.sum(Z * Z, 0), across(across(Z))
     driven = jnp.where((jnp.sum(driven * driven, 0) > tol**2 * squares)[None], driven, jnp.zeros_like(driven))
     free = pseudo_inverse(driven, tol)

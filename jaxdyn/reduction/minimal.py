@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_concrete
@@ -253,8 +253,10 @@ def gauge_invariant(
     return _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
 
 
-def _is_orthogonal(rotation: Float[Array, "n n"]):
-    """Whether a matrix is orthogonal to the rounding error of its construction."""
+def _is_orthogonal(rotation: Float[Array, "n n"] | None) -> Bool[Array, ""]:
+    """Decide whether a matrix is orthogonal to the rounding error of its construction; None is the identity."""
+    if rotation is None:
+        return jnp.asarray(True)
     off = matmul(rotation.T, rotation) - jnp.eye(rotation.shape[0], dtype=rotation.dtype)
     return jnp.max(jnp.abs(off)) <= eps_of(rotation) ** RESIDUAL
 
@@ -374,9 +376,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     change = matmul(null_projector, free) + matmul(back, wanted)
     rank = rank_of(Lambda, back)
     # The bases have a static number of columns, which is valid for this rank alone.
-    is_valid = rank == scene.nv - dof
-    for given in (rotation, motion_rotation):
-        is_valid = is_valid if given is None else is_valid & _is_orthogonal(given)
+    is_valid = (rank == scene.nv - dof) & _is_orthogonal(rotation) & _is_orthogonal(motion_rotation)
     result = RESULTS.where(is_valid, RESULTS.successful, RESULTS.singular_basis)
     result = rank_code(scene, result)
     a = matmul(inverse.T, change - matmul(Wdot.T, v))
