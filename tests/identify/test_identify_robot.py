@@ -624,6 +624,15 @@ def test_white_residuals():
     assert sum(false) <= 3
 
 
+def test_white_noise_stays_white_where_torques_are_shifted():
+    """Half a sample, where splines take most of the noise near half the sampling rate, and keep what is slower."""
+    generator, t = np.random.default_rng(1), np.arange(2001) / 100
+    logs = [identify.Log(t, np.zeros((2001, 1)), tau=generator.normal(size=(2001, 1))) for _ in range(100)]
+    shifted = [identify.shift_torques(log, 0.005) for log in logs]
+    assert sum(not is_white([log], [log.tau])[0] for log in shifted) <= 1
+    assert not is_white(shifted[:1], [shifted[0].tau + np.sin(2 * shifted[0].t)[:, None]])[0]
+
+
 def test_dahl_friction_is_confounded_with_coulomb_friction(truth):
     """A term that is there, at one joint: the split between it and Coulomb friction is known badly, viscous friction well."""
     model, dahl = arm(), identify.EXTRA["dahl"]
