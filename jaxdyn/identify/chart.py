@@ -125,11 +125,16 @@ def _is_feasible(matrix: np.ndarray, inertia: str) -> bool:
 def pseudo_factor(matrix: np.ndarray, inertia: str) -> np.ndarray:
     """U0 with U0 U0^T = P0: upper triangular, or any root where the density alone is fitted."""
     if inertia == "full":
-        # LAPACK's factor is lower triangular; of the reversed matrix, and reversed back, it is upper.
-        return np.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
+        return upper_root(matrix)
     values, vectors = np.linalg.eigh(matrix)
     # A rod's or point's pseudo-inertia is singular and has no Cholesky factor.
     return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def upper_root(matrices: np.ndarray) -> np.ndarray:
+    """Upper-triangular factors U (..., n, n) with U U^T the matrices."""
+    # Reversing rows and columns turns the lower factor of LAPACK into an upper one.
+    return np.linalg.cholesky(matrices[..., ::-1, ::-1])[..., ::-1, ::-1]
 
 
 def barrier_residual(x: Float[Array, "*n"]) -> Float[Array, "*n"]:

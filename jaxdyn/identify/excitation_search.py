@@ -379,7 +379,5 @@ def _shrink(motion: FourierMotion, task: _Task) -> FourierMotion:
 
 
 def _condition(W) -> float:
-    W = np.asarray(W, np.float64)
     length = np.linalg.norm(W, axis=0)
-    s = np.linalg.svd(W / np.where(length > 0, length, 1), compute_uv=False)
-    return float(s[0] / s[-1]) if s[-1] > 0 else np.inf
+    return float(np.linalg.cond(W / np.where(length > 0, length, 1)))

@@ -277,7 +277,7 @@ def redundant_directions(mechanism: Mechanism, markers: np.ndarray | None) -> np
     columns = []
     for place, body in enumerate((-1, *mechanism.bodies)):
         # The frame of a body may move by what commutes with its joint; the world is the body of the base, without a joint.
-        commuting = np.eye(6) if body < 0 else null_space(_ad(np.asarray(model.screws, np.float64)[body]))
+        commuting = np.eye(6) if body < 0 else null_space(np.asarray(se3.ad(model.screws[body]), np.float64))
         for twist in commuting.T:
             column = np.zeros((len(mechanism.places), 6))
             column[place] = twist
@@ -311,12 +311,6 @@ def null_space(matrix: np.ndarray) -> np.ndarray:
     """Orthonormal basis (n, d) of the null space of a matrix (m, n)."""
     _, s, Vt = np.linalg.svd(matrix)
     return Vt[int(np.sum(s > _ZERO * s.max(initial=0.0))) :].T
-
-
-def _ad(twist: np.ndarray) -> np.ndarray:
-    """Matrix of the bracket [twist, .] (6, 6), linear part first."""
-    v, w = host_math.hat(twist[:3]), host_math.hat(twist[3:])
-    return np.block([[w, v], [np.zeros((3, 3)), w]])
 
 
 def nearest_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:

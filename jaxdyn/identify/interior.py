@@ -11,7 +11,14 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Block, Inertias, Numbers, Tied
-from jaxdyn.identify.chart import FROM_PSEUDO, LOG_CHOLESKY_BASIS, LOG_CHOLESKY_PLACES, make_chart, pseudo_factor
+from jaxdyn.identify.chart import (
+    FROM_PSEUDO,
+    LOG_CHOLESKY_BASIS,
+    LOG_CHOLESKY_PLACES,
+    make_chart,
+    pseudo_factor,
+    upper_root,
+)
 from jaxdyn.identify.descent import Descent, Iterate, Method, Watch, descend
 from jaxdyn.identify.regression import free_columns, nominal_parameters
 from jaxdyn.identify.torque_terms import POSITIVE
@@ -352,14 +359,14 @@ def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: fl
     # 1 + h S is definite for h below -1 over the smallest eigenvalue; the relative change of terms has the same rule.
     length = _step_to_boundary(np.linalg.eigvalsh(stretch), change * inverse)
     # The multipliers have a step to their boundary of their own, by the eigenvalues of their change relative to them.
-    roots = _upper_root(state.dual)
+    roots = upper_root(state.dual)
     relative = np.linalg.solve(roots, np.swapaxes(np.linalg.solve(roots, dual_stretch), 1, 2))
     dual_length = _step_to_boundary(
         np.linalg.eigvalsh((relative + np.swapaxes(relative, 1, 2)) / 2),
         dual_change / np.where(state.slack > 0, state.slack, 1),
     )
     # P = A (1 + h S) A^T is refactored; the multipliers are congruent to the new frame, in which P is 1 again.
-    roots = _upper_root(np.eye(4) + length * stretch)
+    roots = upper_root(np.eye(4) + length * stretch)
     dual = np.swapaxes(roots, 1, 2) @ (state.dual + dual_length * dual_stretch) @ roots
     following = _State(state.origin @ roots, terms + length * change, dual, state.slack + dual_length * dual_change)
     # Mean products of the positive quantities and their multipliers: zero at the solution.
@@ -376,9 +383,3 @@ def _step_to_boundary(*rates: np.ndarray) -> float:
     fastest = min((float(rate.min(initial=0)) for rate in rates), default=0.0)
     # Rates above -0.95 allow the full step; the inner minimum also avoids a division by zero.
     return min(1.0, -0.95 / min(fastest, -0.95))
-
-
-def _upper_root(matrices: np.ndarray) -> np.ndarray:
-    """Upper-triangular factors U (n, 4, 4) with U U^T the matrices."""
-    # Reversing rows and columns turns the lower factor of LAPACK into an upper one.
-    return np.linalg.cholesky(matrices[:, ::-1, ::-1])[:, ::-1, ::-1]

@@ -4,13 +4,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.constraints.base import position_residual, rows
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.interior import term_units
-from jaxdyn.identify.logs import Log, as_logs, check_log, signal_sizes
+from jaxdyn.identify.log_repair import LogWarning
+from jaxdyn.identify.logs import Log, as_logs, check_log, root_mean_square, signal_sizes
 from jaxdyn.identify.mechanisms import check_motors, motor_regressor
 from jaxdyn.identify.options import Objective
 from jaxdyn.identify.parameter_tree import Parameters
@@ -34,7 +37,7 @@ from jaxdyn.identify.regression import (
 from jaxdyn.identify.result import Fit, torques_along
 from jaxdyn.identify.torque_terms import LEAVES, POSITIVE, TERMS, Friction, Terms, check_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
-from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.arguments import Numbers, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
@@ -135,7 +138,7 @@ def least_squares(
     base = base_parameters(model, terms, v_s=v_s)
     weights = check_weights(weights, model.nv)
     parts = condense_model(model, logs, v_s=v_s, blocks=blocks)
-    rows, count = triangle_of(parts.rows(weights)), parts.count()
+    triangle, count = triangle_of(parts.rows(weights)), parts.count()
     if count <= len(base):
         samples = sum(map(len, logs))
         raise ValueError(f"the log has {samples} samples of {model.nv} torques, too few for {len(base)} combinations")
@@ -143,7 +146,7 @@ def least_squares(
     columns = free_columns(model.nb, model.nv, terms)
     places = columns[base.independent]
     # Terms that are not fitted keep the model's value and move to the right-hand side.
-    fit = least_squares_by_svd(rows[:, places], rows[:, -1] - rows[:, :-1] @ x0, rcond)
+    fit = least_squares_by_svd(triangle[:, places], triangle[:, -1] - triangle[:, :-1] @ x0, rcond)
     # Directions that stay at the model's values use up no degree of freedom.
     sigma = float(np.sqrt(fit.rest / (count - fit.rank)))
     covariance = sigma**2 * fit.half @ fit.half.T
@@ -290,6 +293,8 @@ def _words(direction: np.ndarray, names: Sequence[str]) -> str:
 
 
 _BLOCKS = 20
+# Residual of loops (m, rad), and share of their velocities, beyond which a log contradicts the mechanism.
+_OPEN, _SLIP = 0.01, 0.1
 
 
 class MechanismFit(NamedTuple):
@@ -330,7 +335,9 @@ def fit_mechanism(
     all joints (`complete_log`); `motors`: names of joints, as many as degrees of freedom; `terms`, `v_s`, `prior` as of
     `fit_torques`.
 
-    **Raises:** ValueError for another number of motors, and as `fit_parameters`.
+    **Raises:** ValueError for another number of motors, torques of zero alone, and as `fit_parameters`.
+
+    **Warns:** `LogWarning` for a log whose loops are open, or whose velocities the loops do not allow.
 
     Source: Khalil & Dombre (2002), chapters 9 and 10, base parameters of closed chains.
     """
@@ -343,18 +350,30 @@ def fit_mechanism(
     names = every[: 10 * model.nb] + tuple(f"{motor}.{term}" for term in terms for motor in motors)
     regressors = [motor_regressor(start, one, motors, terms, v_s) for one in logs]
     W, tau = np.concatenate(regressors), np.concatenate([np.asarray(one.tau)[:, columns] for one in logs])
-    weights = 1 / np.sqrt(np.mean(tau**2, axis=0))
+    if not tau.any():
+        raise ValueError(f"the torques of the motors {', '.join(motors)} are all zero; log a mechanism that is driven")
+    size = root_mean_square(tau)
+    # A torque that is always zero borrows the scale of the largest one.
+    weights = 1 / np.where(size > 0, size, size.max())
+    for number, one in enumerate(logs, 1):
+        gap, slip = map(float, _loop_errors(start, *(jnp.asarray(x, model.home.dtype) for x in (one.q, one.v, one.t))))
+        if gap > _OPEN or slip > _SLIP:
+            warn(
+                f"log {number}: the loops are open by up to {gap:.2g} (m, rad), and velocities are off by {100 * slip:.2g} %: "
+                "complete the log by jd.identify.complete_log, or check the geometry",
+                LogWarning,
+            )
     base, _ = group_columns((W * weights[:, None]).reshape(-1, len(names)), names, model.nb, np.dtype(model.home.dtype))
     x0 = _numbers(start, columns, terms)
     # Springs and the friction of passive joints stay those of the file.
     places = tuple(columns.tolist())
     rest = tau - np.concatenate([torques_along(start, one, places)[:, columns] for one in logs])
-    rows, errors = (W[:, :, base.independent] * weights[:, None]), rest * weights
-    flat = rows.reshape(-1, len(base))
+    table, errors = (W[:, :, base.independent] * weights[:, None]), rest * weights
+    flat = table.reshape(-1, len(base))
     if len(flat) <= len(base):
         raise ValueError(f"the logs have {len(flat)} torques of motors for {len(base)} combinations; log more")
     linear = least_squares_by_svd(flat, errors.reshape(-1), 1e-9)
-    residual = errors - rows @ linear.change
+    residual = errors - table @ linear.change
     # Relative to the torque, as `Objective.noise`; noise-free logs stay well posed.
     noise = max(float(np.sqrt(linear.rest / (len(flat) - linear.rank))), 1e-6)
     tree = Parameters(start).inertias(weight=prior)
@@ -364,8 +383,8 @@ def fit_mechanism(
     fit = fit_parameters(start, logs, tree, Objective("torque", observed=tuple(motors), noise=2**0.5 * noise))
     edges = np.cumsum([len(one) for one in logs])[:-1]
     size = effective_sample_size(np.split(residual, edges))
-    p, tables = len(base), np.array_split(np.concatenate([rows, errors[:, :, None]], axis=2), _BLOCKS)
-    triangles = [[triangle_of(table.reshape(-1, p + 1))] for table in tables]
+    p, tables = len(base), np.array_split(np.concatenate([table, errors[:, :, None]], axis=2), _BLOCKS)
+    triangles = [[triangle_of(part.reshape(-1, p + 1))] for part in tables]
     blocks = Blocks(triangles, (np.arange(p),), p, np.array([len(x) for x in tables]), np.zeros(len(tables), int))
     std, factor = scatter(blocks, np.ones(1), linear.change, np.arange(p), linear.half, size)
     return MechanismFit(
@@ -378,6 +397,18 @@ def fit_mechanism(
         linear.condition,
         weakest_directions(linear, base.names),
     )
+
+
+@eqx.filter_jit
+def _loop_errors(scene: Scene, q, v, t):
+    """Largest residual of the constraints along a log, m or rad, and of their velocities as a share of the largest part."""
+
+    def one(q, v, t):
+        at = rows(scene, q, v, t)
+        return tuple(jnp.max(jnp.abs(x)) for x in (position_residual(scene, q, t), at.velocity, at.A * v[None]))
+
+    gap, slip, size = (jnp.max(x) for x in jax.vmap(one)(q, v, t))
+    return gap, slip / jnp.where(size > 0, size, 1)
 
 
 def _with_friction(scene: Scene, motors: np.ndarray, terms, v_s: float, sizes) -> Scene:

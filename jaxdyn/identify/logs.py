@@ -264,24 +264,25 @@ def signal_sizes(logs: Sequence[Log]) -> list[np.ndarray]:
     ]
 
 
-def travel_ranges(model: Model, log: Log) -> np.ndarray:
-    """Range of motion (nv,) of each coordinate, rad or m: of its position, or of its integrated velocity for joints with several.
+def motion_paths(model: Model, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """Paths (n, nv) of each coordinate, rad or m: its positions, and the integral of its velocity.
 
-    The integral of a velocity is used where no coordinate of q belongs to it alone, as for quaternions.
+    The integral is used for both where no coordinate of q belongs to a velocity alone, as for quaternions.
     """
     q, v, t = (np.asarray(x, np.float64) for x in (log.q, log.v, log.t))
     steps = (v[1:] + v[:-1]) / 2 * np.diff(t)[:, None]
-    path = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(steps, axis=0)])
+    integrals = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(steps, axis=0)])
+    positions = integrals.copy()
     slices = zip(model.topology.q_slices, model.topology.v_slices, strict=True)
     for of_q, of_v in slices:
         if of_q.stop - of_q.start == of_v.stop - of_v.start == 1:
-            path[:, of_v] = q[:, of_q]
-    return np.ptp(path, axis=0)
+            positions[:, of_v] = q[:, of_q]
+    return positions, integrals
 
 
 def idle_coordinates(model: Model, logs: Sequence[Log]) -> tuple[int, ...]:
     """Indices in v of the coordinates that travel less than 0.02 rad, or 2 mm, in every log."""
-    travel = np.max([travel_ranges(model, log) for log in logs], axis=0)
+    travel = np.max([np.ptp(motion_paths(model, log)[0], axis=0) for log in logs], axis=0)
     return tuple(int(j) for j in np.flatnonzero(travel < np.where(are_angles(model), _TRAVEL_ANGLE, _TRAVEL_LENGTH)))
 
 

@@ -309,9 +309,8 @@ class Solver(eqx.Module):
 
     def __check_init__(self):
         methods = (GAUSS_NEWTON, *SOLVERS, *METHODS)
-        if isinstance(self.method, str) and self.method not in methods:
-            raise ValueError(f"method is {self.method!r}; give one of {methods} or an optax.GradientTransformation")
-        if not (isinstance(self.method, str) or (hasattr(self.method, "init") and hasattr(self.method, "update"))):
+        is_optax = hasattr(self.method, "init") and hasattr(self.method, "update")
+        if not (self.method in methods if isinstance(self.method, str) else is_optax):
             raise ValueError(f"method is {self.method!r}; give one of {methods} or an optax.GradientTransformation")
         check_count(self.steps, "steps")
         check_count(self.starts, "starts")

@@ -130,9 +130,7 @@ def fit_gains(
     """
     unloaded, loaded = as_logs(unloaded, model), as_logs(loaded, model)
     terms = check_terms(terms, 1.0)
-    body = model.body_names[-1] if body is None else body
-    if body not in model.body_names:
-        raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
+    body = _holder(model, body)
     centre = np.asarray(centre, np.float64)
     if not (np.isfinite(mass) and mass > 0) or centre.shape != (3,) or not np.isfinite(centre).all():
         raise ValueError(f"mass is {mass} and centre {centre.tolist()}; give a positive mass (kg) and a point (3,) (m)")
@@ -162,6 +160,13 @@ def fit_gains(
         )
     names = tuple(name for name, yes in zip(coordinate_names(model), is_identifiable, strict=True) if yes)
     return DriveGains(gains, std, factor, names, error, velocity, result)
+
+
+def _holder(model: Model, body: str | None) -> str:
+    """Name of the body that holds the payload, the last one for None. **Raises:** ValueError for an unknown one."""
+    if body is not None and body not in model.body_names:
+        raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
+    return model.body_names[-1] if body is None else body
 
 
 class _Problem:
@@ -391,9 +396,7 @@ def fit_payload(
     """
     check_bodies(model)
     unloaded, loaded = as_logs(unloaded, model), as_logs(loaded, model)
-    body = model.body_names[-1] if body is None else body
-    if body not in model.body_names:
-        raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
+    body = _holder(model, body)
     number = model.body_names.index(body)
     robot = fit_robot(model, unloaded, terms, **options) if robot is None else robot
     unloaded, loaded = (tuple(robot.align(log) for log in logs) for logs in (unloaded, loaded))

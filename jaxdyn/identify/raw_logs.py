@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.log_repair import LogWarning, repair_log
+from jaxdyn.identify.log_repair import LogWarning, check_held, repair_log
 from jaxdyn.identify.logs import (
     Log,
     are_angles,
     idle_coordinates,
     log_rate,
     low_pass,
+    motion_paths,
     root_mean_square,
-    travel_ranges,
 )
 from jaxdyn.identify.regression import log_regressor, nominal_parameters
 from jaxdyn.model.arguments import Checked, Numbers, warn
@@ -68,6 +68,8 @@ def from_raw(
 
     **Returns:** `Log` with t, q, v, a, tau.
 
+    **Warns:** `LogWarning` for torques that stay at their largest value, and what was unwrapped, interpolated or left out.
+
     **Raises:** ValueError for all that `Log` refuses; an `order`, `trim` or `every` that is no whole number or too small; too few
     samples for the filter and the trimming; a cut-off above half the sampling rate; a gap in time longer than half a period of
     the cut-off, which interpolation would invent; outliers, with row and joint; positions that jump and do not come back,
@@ -82,6 +84,8 @@ def from_raw(
         raise ValueError(f'cutoff is {cutoff!r}; give a frequency in Hz, or "auto"')
     # Before the filter, whose response would spread a corrupted sample over its neighbours.
     raw = repair_log(Log(t, q, tau=tau, joint_names=joint_names), model, unwrap=unwrap, outliers=outliers)
+    for line in check_held(raw, model):
+        warn(line, LogWarning)
     cutoff = choose_cutoff(raw).frequency if isinstance(cutoff, str) else cutoff
     t, q, tau = (np.asarray(x, np.float64) for x in (raw.t, raw.q, raw.tau))
     if q.shape[1] != tau.shape[1]:
@@ -106,22 +110,24 @@ def from_raw(
             f"gap of {t[widest + 1] - t[widest]:.4g} s after row {widest} (t={t[widest]:.6g} s), longer than half a "
             f"period of cutoff={cutoff} Hz; cut the log there or lower the cut-off"
         )
-    grid = np.linspace(t[0], t[-1], n)
-
-    def uniform(x):
-        return np.stack([np.interp(grid, t, column) for column in x.T], axis=1)
 
     def low(x):
         return low_pass(x, rate, cutoff, order)
 
-    q, tau = spline_lines(t, q, "positions"), spline_lines(t, tau, "torques")
-    positions, torques = low(uniform(q)), low(uniform(tau))
+    grid, q, tau = _uniform(t, spline_lines(t, q, "positions"), spline_lines(t, tau, "torques"))
+    positions, torques = low(q), low(tau)
     # A difference amplifies noise in proportion to its frequency: each result goes through the low-pass again.
     v = low(differentiate(grid, positions))
     a = low(differentiate(grid, v))
     # Decimated after the low-pass: before it, frequencies above half of the new rate would alias.
     keep = slice(trim, n - trim, every)
     return Log(grid[keep], positions[keep], v[keep], a[keep], torques[keep], joint_names=raw.joint_names, cutoff=cutoff)
+
+
+def _uniform(t: np.ndarray, *signals: np.ndarray) -> list[np.ndarray]:
+    """Even times, as many as t, and signals (n, k) interpolated linearly to them."""
+    grid = np.linspace(t[0], t[-1], len(t))
+    return [grid, *(np.stack([np.interp(grid, t, column) for column in x.T], axis=1) for x in signals)]
 
 
 # Share of the velocity's power that defines the band of the motion, and the factor above it up to which a residual may be
@@ -245,8 +251,7 @@ class _Spectra(NamedTuple):
         if len(t) < 32:
             raise ValueError(f"{len(t)} samples are too few to choose a cut-off by their spectrum; give one in Hz")
         # The transform assumes uniform samples; time stamps of raw logs have jitter.
-        grid = np.linspace(t[0], t[-1], len(t))
-        q, tau = (np.stack([np.interp(grid, t, column) for column in x.T], axis=1) for x in (q, tau))
+        grid, q, tau = _uniform(t, q, tau)
         rate = (len(t) - 1) / float(t[-1] - t[0])
         # Differentiate before windowing: a path that does not end at its start would be a jump in the spectrum.
         frequency, velocity = power(differentiate(grid, q), rate)
@@ -334,14 +339,21 @@ def _motion(frequency: np.ndarray, position: np.ndarray, velocity: np.ndarray) -
 _TURNS, _OFF = 3.0, 20.0
 # So many samples tell the size of a torque.
 _COMPARED = 500
-# Below this share of its own largest velocity a joint has not begun to move; from this share of the error on it is worth a word.
+# Below this share of its own largest velocity a joint has not begun to move; from this share of the error on it is worth a word,
+# and so is an error of this share of the torque, or of the path.
 _REST, _MUCH = 0.01, 0.5
+# Steps in time beyond so many usual ones are gaps, over which velocities do not tell the path.
+_GAP = 5.0
 
 
 def log_warnings(model: Model, log: Log, residual: np.ndarray) -> list[str]:
-    """Warnings about a log of a fit with the errors `residual` (n, nv): contents and starts at rest that look wrong."""
+    """Warnings about a log of a fit with the errors `residual` (n, nv): what looks wrong in it, and in its errors."""
     labels = columns_of(model).v
-    return [*check_log_content(model, log, labels), *check_rest(log, residual, labels)]
+    return [
+        *check_log_content(model, log, labels),
+        *check_rest(log, residual, labels),
+        *check_explained(model, log, residual, labels),
+    ]
 
 
 def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
@@ -351,6 +363,7 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
     - Torques that are less than a twentieth, or more than twenty times, of what the nominal bodies need, at most joints where
       these need a tenth of the largest: motor torques in front of the gears, or other units.
     - Joints that hardly move, whose friction and rotor inertia are not identifiable.
+    - Positions that do not follow the velocities, and torques that stay at their largest value.
     """
     lines = []
     q = np.abs(np.asarray(log.q, np.float64))
@@ -380,18 +393,47 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
             f"torques of {names} are about {np.median(ratio):.0f} times what the file's bodies need: are they in N mm or in per "
             "cent? N m are expected"
         )
-    travel = travel_ranges(model, log)
+    positions, integrals = motion_paths(model, log)
+    travel, idle = np.ptp(positions, axis=0), idle_coordinates(model, [log])
     slow = [
         f"{labels[j]} ({travel[j]:.2g} {'rad' if angle else 'm'})"
         for j, angle in enumerate(are_angles(model))
-        if j in idle_coordinates(model, [log])
+        if j in idle
     ]
     if slow:
         lines.append(
             f"{', '.join(slow)} hardly moved: friction and rotor inertia there are not identifiable from this log; move these "
             "joints farther"
         )
-    return lines
+    off = _path_errors(np.asarray(log.t, np.float64), positions, integrals, are_angles(model))
+    wrong = [labels[j] for j in np.flatnonzero(off > _MUCH * positions.std(axis=0)).tolist() if j not in idle]
+    if wrong:
+        lines.append(
+            f"positions of {', '.join(wrong)} do not follow the velocities: check units, signs, the order of columns and the "
+            "unit of time"
+        )
+    return lines if log.cutoff is not None else [*lines, *check_held(log, model)]
+
+
+def _path_errors(t: np.ndarray, positions: np.ndarray, integrals: np.ndarray, is_angle: np.ndarray) -> np.ndarray:
+    """Deviations (nv,) of positions from integrals of velocities, without constant errors of these and without gaps."""
+    if len(t) < 3:
+        return np.zeros(len(is_angle))
+    steps, changes = np.diff(t), np.diff(positions, axis=0)
+    # Logs of joints that turn without end may jump by a turn.
+    is_told = (steps <= _GAP * np.median(steps))[:, None] & ~(is_angle & (np.abs(changes) > np.pi))
+    off = np.cumsum(np.where(is_told, changes - np.diff(integrals, axis=0), 0.0), axis=0)
+    line = np.stack([np.ones(len(off)), t[1:] - t[0]], axis=1)
+    return np.sqrt(np.mean((off - line @ np.linalg.lstsq(line, off, rcond=None)[0]) ** 2, axis=0))
+
+
+def check_explained(model: Model, log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
+    """Warning about joints that move and whose errors (n, nv) have most of the power of the torque."""
+    idle = idle_coordinates(model, [log])
+    power, lost = (np.sum(np.asarray(x, np.float64) ** 2, axis=0) for x in (log.tau, residual))
+    wrong = [labels[j] for j in np.flatnonzero(lost > _MUCH * power).tolist() if j not in idle]
+    advice = "check signs, units and the order of columns, or noise is as large as the torque"
+    return [f"the fit leaves most of the power of the torques of {', '.join(wrong)}: {advice}"] if wrong else []
 
 
 def check_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:

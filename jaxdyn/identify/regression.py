@@ -443,6 +443,6 @@ def check_weights(weights, nv: int) -> np.ndarray:
     if weights is None:
         return np.ones(nv)
     weights = np.asarray(weights, np.float64)
-    if weights.shape != (nv,) or not np.all(weights > 0):
+    if weights.shape != (nv,) or not np.all((weights > 0) & (weights < np.inf)):
         raise ValueError(f"weights is {weights.tolist()}; give {nv} positive numbers, one over the noise of each joint")
     return weights

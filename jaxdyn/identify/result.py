@@ -135,9 +135,7 @@ def rollout(
     `simulation` by its options' own names. The time of a `Model` starts at zero in every segment, that of anything else is the
     log's.
     """
-    check_replay(INITIAL[0], hold)
-    scene, data = scene_and_segments(system, log, horizon, friction)
-    return _rollout(scene, data, hold, with_even_steps(simulation_options(substeps, simulation), data))
+    return _replay(system, log, friction, horizon, hold, simulation_options(substeps, simulation))[2:]
 
 
 def trajectory_error(
@@ -156,22 +154,21 @@ def trajectory_error(
 
     and the same of v. Arguments as in `rollout`.
     """
-    q, v = rollout(system, log, friction, horizon=horizon, hold=hold, substeps=substeps, **simulation)
-    scene, data = scene_and_segments(system, log, horizon, friction)
+    scene, data, q, v = _replay(system, log, friction, horizon, hold, simulation_options(substeps, simulation))
     errors = _segment_errors(scene.system, data, q, v, motion_scale(scene.system, data))
     of_q, of_v = (100 * float(jnp.sqrt(jnp.mean(error**2))) for error in errors)
     return of_q, of_v
 
 
-def scene_and_segments(
-    system: Any, log: Log | Sequence[Log], horizon: int | None, friction: Any = None
-) -> tuple[Scene, Segments]:
-    """Scene of a system, with one more force, and the segments of a log for it."""
+def _replay(system: Any, log: Log, friction, horizon: int | None, hold: str, options: dict):
+    """Scene of a system, with one more force, the segments of a log for it, and their simulated q and v."""
+    check_replay(INITIAL[0], hold)
     scene = as_scene(system)
-    log = as_logs(log, scene.system, needs=("v",))
+    logs = as_logs(log, scene.system, needs=("v",))
     if friction is not None:
         scene = add_constraints(scene, (), (*scene.forces, friction))
-    return scene, segments(log, horizon, state_dtype(scene.system), restart=isinstance(system, Model))
+    data = segments(logs, horizon, state_dtype(scene.system), restart=isinstance(system, Model))
+    return scene, data, *_rollout(scene, data, hold, with_even_steps(options, data))
 
 
 def check_replay(initial: str, hold: str) -> None:

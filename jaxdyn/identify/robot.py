@@ -256,8 +256,9 @@ def fit_robot(
     **Raises:** ValueError when logs and model do not fit together, for unknown terms, nominal bodies that are not feasible, and
     arguments out of range.
 
-    **Warns:** `LogWarning` for logs that look wrong: angles in degrees, torques in other units or in front of the gears, joints
-    that hardly move, and errors that are due to a start at rest.
+    **Warns:** `LogWarning` for logs that look wrong: angles in degrees, positions that do not follow the velocities, torques in
+    other units, in front of the gears or of a saturated sensor, joints that hardly move, and errors that are most of the torque
+    or due to a start at rest.
 
     Source: Rucker & Wensing (2022), log-Cholesky coordinates; Lee, Wensing & Park (2020), "Geometric robot dynamic
     identification: a convex programming approach", divergence and convexity; Stone (1974), cross-validation; Holland & Welsch
@@ -275,7 +276,7 @@ def fit_robot(
     )
     delays = search_delays(setting, np.zeros(model.nv)) if is_found else _given_delays(delay, model.nv)
     if delays is not None:
-        logs = tuple(shift_torques(log, delays.seconds) for log in given)
+        logs = _shift_logs(given, delays.seconds)
     problem = RobotLogs(model, logs, basic, extra, inertia, blocks)
     # One set of joint weights and loads for the whole search: settings are compared on the same scale.
     problem.refine(setting, fixed, rounds=2)
@@ -297,7 +298,7 @@ def fit_robot(
         trials = tuple(trying.trials.values())
     if is_found and delays is not None:  # at the setting chosen
         delays = search_delays(setting, delays.seconds)
-        logs = tuple(shift_torques(log, delays.seconds) for log in given)
+        logs = _shift_logs(given, delays.seconds)
         problem = RobotLogs(model, logs, basic, extra, inertia, blocks)
     estimate = problem.refine(setting, fixed)
     fit = problem.result(setting, estimate)
@@ -370,6 +371,6 @@ def fit_torques(
 
 
 def check_prior(prior) -> None:
-    """Check the weight of the prior. **Raises:** ValueError for a prior that is not positive."""
-    if not prior > 0:
+    """Check the weight of the prior. **Raises:** ValueError for a prior that is not positive and finite."""
+    if not 0 < prior < np.inf:
         raise ValueError(f"prior is {prior}; it must be positive: torques alone do not determine single bodies")

@@ -41,7 +41,7 @@ import numpy as np
 
 from jaxdyn.identify.condensed_fit import FROM_PRIOR, Data, Estimate, Intervals, Setting, Spread, local_coordinates
 from jaxdyn.identify.regression import Blocks
-from jaxdyn.identify.uncertainty import block_groups, invert, psd_root, student
+from jaxdyn.identify.uncertainty import block_groups, invert, jackknife, psd_root, student
 
 VELOCITIES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 # Factors by which v_s is refined between two of these, in turn.
@@ -178,9 +178,9 @@ def search(
     candidates: Callable[[Setting], Sequence[int]],
     loss_squares: Callable[[Setting, Sequence[Setting]], list[np.ndarray] | None],
     *,
-    velocities=VELOCITIES,
-    priors=PRIORS,
-    losses=ROBUST,
+    velocities,
+    priors,
+    losses,
 ) -> Setting:
     """Coordinate descent over v_s, the loss, terms joint by joint in order of their gains, the prior, v_s and the loss again.
 
@@ -320,9 +320,10 @@ def find_shifts(
     H = G.sum(axis=0) + prior
     # Unit diagonal: parameters differ by many orders of magnitude in size.
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-    T, g, G, H = T * unit, g * unit, G * unit * unit[:, None], H * unit * unit[:, None]
+    T, g, scale = T * unit, g * unit, unit * unit[:, None]
     # As of `intervals`: at least weight 1 counts.
     root = unit[:, None] * psd_root(prior) * np.sqrt(max(setting.prior, 1.0))
+    G, H, prior = G * scale, H * scale, prior * scale
 
     def extend(terms: tuple[tuple[str, int], ...], new: np.ndarray) -> Shift | None:
         """Shift by the coefficients `new`, None where independent errors alone explain them."""
@@ -333,18 +334,16 @@ def find_shifts(
         # Costs no jackknife, and errs on the side of the term.
         if not np.any(np.abs(step[own:]) > 1.5 * np.sqrt(np.diag(inverse)[own:])):
             return None
-        G_kept, ridge = G[:, kept][:, :, kept], 1e-12 * np.eye(len(kept))
-        right = g[:, kept] + G_kept @ step
-        replicates = np.linalg.solve(H[np.ix_(kept, kept)] + ridge - G_kept, right[..., None])[..., 0]
-        scatter = (replicates - replicates.mean(axis=0)).T * np.sqrt((len(G) - 1) / len(G))
+        G_kept = G[:, kept][:, :, kept]
+        replicates = jackknife(G_kept, g[:, kept] + G_kept @ step, prior[np.ix_(kept, kept)])
         pulled = inverse @ root[kept]
-        both = np.concatenate([scatter, pulled], axis=1)
+        both = np.concatenate([replicates.root, pulled], axis=1)
         # The first link's weight and a spring at its joint are one torque: only the prior tells them apart, and the logs do not.
         sizes, by_prior = np.linalg.norm(both[own:], axis=1), np.linalg.norm(pulled[own:], axis=1)
         ratios = np.abs(step[own:]) / np.maximum(sizes, 1e-300)
         clearness = float(np.max(ratios, where=by_prior**2 <= FROM_PRIOR * sizes**2, initial=0.0))
-        factor, minimum = student(len(G) - 1), student(len(G) - 1, _LEVEL)
-        return Shift(terms, T[:, kept] @ step, T[:, kept] @ both, factor, clearness, minimum)
+        minimum = student(len(G) - 1, _LEVEL)
+        return Shift(terms, T[:, kept] @ step, T[:, kept] @ both, replicates.factor, clearness, minimum)
 
     ends = own + np.cumsum([len(places) for _, places in tried])
     indices = {term: np.arange(end - len(places), end) for end, (term, places) in zip(ends, tried, strict=True)}

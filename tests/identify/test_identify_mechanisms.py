@@ -305,6 +305,28 @@ def test_intervals_of_a_mechanism_cover_the_truth(tmp_path):
     assert np.max(np.mean(stds, axis=0) / np.std(errors, axis=0)) < 2
 
 
+@pytest.mark.long
+def test_logs_that_contradict_a_mechanism_are_named(tmp_path):
+    """Open loops, velocities that these do not allow, and motors without a torque."""
+    scene, motors = loaded(tmp_path, "five-bar", (1.1, 1.2)), LOOPS["five-bar"][1]
+    log, *_ = driven(scene, motors, np.linspace(0, 8, 60))
+    passive = scene.system.v_index("p1")
+
+    def changed(**signals):
+        values = {name: getattr(log, name) for name in ("t", "q", "v", "a", "tau")} | signals
+        return jd.identify.Log(**values)
+
+    for name, words in (("q", "loops are open by up to 0.0"), ("v", r"velocities are off by \d\d %")):
+        wrong = np.array(getattr(log, name))
+        wrong[:, passive] *= 1.3
+        with pytest.warns(jd.identify.LogWarning, match=words):
+            fit_mechanism(scene, changed(**{name: wrong}), motors, TERMS)
+    with pytest.raises(ValueError, match="torques of the motors m1, m2 are all zero"):
+        fit_mechanism(scene, changed(tau=0 * log.tau), motors, TERMS)
+    alone = np.where(np.arange(scene.nv) == scene.system.v_index("m1"), log.tau, 0)
+    assert np.isfinite(fit_mechanism(scene, changed(tau=alone), motors, TERMS).values).all()
+
+
 def test_motors_must_be_as_many_as_degrees_of_freedom(tmp_path):
     scene = loaded(tmp_path, "five-bar", (0.9, 1.5))
     log, *_ = driven(scene, ("m1", "m2"), np.linspace(0, 1, 11))

@@ -12,7 +12,8 @@ from benchmarks.identify_selection import motion as random_motion
 from jaxdyn import identify, inertia
 from jaxdyn.cli.identify_tables import payload_text
 from jaxdyn.identify.condensed_fit import Setting, eliminate, fit_blocks, share_of_extra
-from jaxdyn.identify.logs import filter_like_log, idle_coordinates, samples_for_jumps, travel_ranges
+from jaxdyn.identify.log_repair import check_held
+from jaxdyn.identify.logs import filter_like_log, idle_coordinates, motion_paths, samples_for_jumps
 from jaxdyn.identify.raw_logs import check_log_content, check_rest, motion_band, vibration
 from jaxdyn.identify.regression import block_slices, condense_model
 from jaxdyn.identify.robot_logs import RobotLogs, huber_weights
@@ -338,7 +339,9 @@ def test_bad_arguments_raise(truth):
         ("v_s is 'fast'", {"v_s": "fast"}),
         ("v_s is -1.0", {"v_s": -1.0, "prior": 1.0}),
         ("prior is 0", {"prior": 0.0}),
+        ("prior is inf", {"prior": np.inf}),
         (r"weights is \[1.0, -1.0\]", {"weights": (1.0, -1.0)}),
+        (r"weights is \[1.0, inf\]", {"weights": (1.0, np.inf)}),
         ("blocks is 1", {"blocks": 1}),
     ):
         with pytest.raises(ValueError, match=words):
@@ -680,7 +683,7 @@ def test_travels_of_joints_with_several_coordinates():
     v[:, 0], v[:, 5], v[:, 6] = 0.3, 0.1, 0.001
     q = np.concatenate([np.zeros((101, 6)), np.ones((101, 1)), 0.001 * t[:, None]], axis=1)
     log = identify.Log(t, q, v, v, v)
-    np.testing.assert_allclose(travel_ranges(model, log), [0.3, 0, 0, 0, 0, 0.1, 0.001], atol=1e-12)
+    np.testing.assert_allclose(np.ptp(motion_paths(model, log)[0], axis=0), [0.3, 0, 0, 0, 0, 0.1, 0.001], atol=1e-12)
     assert idle_coordinates(model, [log]) == (1, 2, 3, 4, 6)
 
 
@@ -703,6 +706,34 @@ def test_log_checks(truth):
     assert any("are they in degrees" in line for line in changed(q=np.rad2deg(good.q)))
     still = changed(q=good.q * [1, 0], v=good.v * [1, 0], a=good.a * [1, 0])
     assert any(line.startswith("b (0 rad) hardly moved") for line in still)
+    for signals in ({"q": good.q * [1, -1]}, {"v": np.rad2deg(good.v)}, {"t": 1000 * good.t}, {"q": good.q[:, ::-1]}):
+        assert any("do not follow the velocities" in line for line in changed(**signals))
+    # A wrapped angle, an offset of the velocity, and samples left out for a while are no contradiction.
+    wrapped = changed(q=(good.q + np.pi) % (2 * np.pi) - np.pi, v=good.v + 0.1)
+    whole = [np.delete(x, slice(100, 150), axis=0) for x in (good.t, good.q, good.v, good.a, good.tau)]
+    assert wrapped == [] and check_log_content(model, identify.Log(*whole), names) == []
+
+
+def test_saturated_torques_are_named():
+    """In a log as it is, and before the low-pass; a coarse sensor, and a torque of zero at one side, are not."""
+    log = measured(arm(), motion(1, 3000, 60.0))
+    limit = np.quantile(np.abs(log.tau[:, 1]), 0.9)
+    clipped = identify.Log(log.t, log.q, log.v, log.a, np.clip(log.tau, [-np.inf, -limit], [np.inf, limit]))
+    (line,) = check_log_content(arm(), clipped, ("a", "b"))
+    assert line.startswith("torques of b_joint stay at their largest value")
+    with pytest.warns(identify.LogWarning, match="torques of 2 stay"):
+        identify.from_raw(log.t, log.q, clipped.tau)
+    step = np.ptp(log.tau, axis=0) / 20
+    for tau in (step * np.round(log.tau / step), np.maximum(log.tau, 0)):
+        assert check_held(identify.Log(log.t, log.q, log.v, log.a, tau)) == []
+
+
+def test_torques_that_no_fit_explains_are_named(truth):
+    model, good = arm(), measured(arm(), motion(1), truth, noise=0.01)
+    given = {"terms": identify.TERMS, "v_s": 0.01, "prior": 1.0, "robust": None, "weights": None}
+    turned = identify.Log(good.t, good.q, good.v, good.a, -good.tau)
+    with pytest.warns(identify.LogWarning, match="the fit leaves most .* of a_joint, b_joint"):
+        identify.fit_robot(model, turned, **given)
 
 
 def test_fits_warn_of_logs_in_other_units_and_of_starts_at_rest(truth):
@@ -710,8 +741,10 @@ def test_fits_warn_of_logs_in_other_units_and_of_starts_at_rest(truth):
     model, good = arm(), measured(arm(), motion(1), truth, noise=0.01)
     given = {"terms": identify.TERMS, "v_s": 0.01, "prior": 1.0, "robust": None, "weights": None}
     scaled = identify.Log(good.t, good.q, good.v, good.a, 1000 * good.tau)
-    with pytest.warns(identify.LogWarning, match="log 2: torques of a_joint, b_joint are about .* N mm"):
+    with pytest.warns(identify.LogWarning) as found:
         identify.fit_robot(model, [good, scaled], **given)
+    (line,) = [str(one.message) for one in found if "N mm" in str(one.message)]
+    assert line.startswith("log 2: torques of a_joint, b_joint are about ")
     held = [np.concatenate([np.full((50, 2), row), x]) for row, x in ((good.q[0], good.q), (0, good.v), (0, good.a))]
     tau = np.concatenate([good.tau[:1] + np.array([[0.0, 3.0]]) * np.ones((50, 1)), good.tau])
     still = identify.Log(np.arange(350) * good.t[1], *held, tau)
