@@ -76,7 +76,7 @@ def sdf(path, digits, tilt):
     return path
 
 
-def urdf_text(digits, tilt, gazebo="", turns=False):
+def urdf_text(digits, tilt, turns=False):
     text = Writer(digits)
     parts = "<link name='world'/>"
     for joint, name in zip("abc", BARS, strict=True):
@@ -87,19 +87,18 @@ def urdf_text(digits, tilt, gazebo="", turns=False):
             f"<parent link='{PARENTS[name]}'/><child link='{name}'/><axis xyz='0 1 0'/>"
             "<limit lower='-9' upper='9' effort='9' velocity='9'/></joint>"
         )
-    if not gazebo:
-        for name in ("rod", "rocker"):
-            turn = pose_of(name, tilt)[0].inv() * tilt
-            kind = "revolute" if turns and name == "rod" else "fixed"
-            parts += (
-                f"<link name='tip_{name}'>"
-                + (f"<inertial>{text.inertial()}</inertial>" if turns and name == "rod" else "")
-                + f"</link><joint name='to_{name}' type='{kind}'>"
-                f"<origin xyz='{text(tip_in(name, tilt))}' rpy='{text(turn.as_euler('xyz'))}'/><parent link='{name}'/>"
-                f"<child link='tip_{name}'/><axis xyz='0 1 0'/>"
-                "<limit lower='-9' upper='9' effort='9' velocity='9'/></joint>"
-            )
-    return f"<robot name='bars'>{parts}{gazebo}</robot>"
+    for name in ("rod", "rocker"):
+        turn = pose_of(name, tilt)[0].inv() * tilt
+        kind = "revolute" if turns and name == "rod" else "fixed"
+        parts += (
+            f"<link name='tip_{name}'>"
+            + (f"<inertial>{text.inertial()}</inertial>" if turns and name == "rod" else "")
+            + f"</link><joint name='to_{name}' type='{kind}'>"
+            f"<origin xyz='{text(tip_in(name, tilt))}' rpy='{text(turn.as_euler('xyz'))}'/><parent link='{name}'/>"
+            f"<child link='tip_{name}'/><axis xyz='0 1 0'/>"
+            "<limit lower='-9' upper='9' effort='9' velocity='9'/></joint>"
+        )
+    return f"<robot name='bars'>{parts}</robot>"
 
 
 def urdf(path, digits, tilt, kind="3d"):
@@ -111,17 +110,6 @@ def urdf(path, digits, tilt, kind="3d"):
 
 def urdf_6d(path, digits, tilt):
     return urdf(path, digits, tilt, "6d")
-
-
-def gazebo(path, digits, tilt):
-    place = Writer(digits)(tip_in("rocker", tilt))
-    element = (
-        f"<gazebo><joint name='d' type='revolute'><pose>{place} 0 0 0</pose><parent>rod</parent><child>rocker</child>"
-        "<axis><xyz>0 1 0</xyz></axis></joint></gazebo>"
-    )
-    path = path.with_suffix(".urdf")
-    path.write_text(urdf_text(digits, tilt, element))
-    return path
 
 
 def mjcf(path, digits, tilt):
@@ -146,7 +134,7 @@ def mjcf(path, digits, tilt):
     return path
 
 
-WRITERS = {"sdf": sdf, "urdf_3d": urdf, "urdf_6d": urdf_6d, "gazebo": gazebo, "mjcf": mjcf}
+WRITERS = {"sdf": sdf, "urdf_3d": urdf, "urdf_6d": urdf_6d, "mjcf": mjcf}
 
 
 def crank_angles(path, **options):

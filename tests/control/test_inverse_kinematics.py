@@ -194,7 +194,7 @@ def test_directions_and_the_centre_of_mass():
     assert other.errors.shape == (5,)
 
 
-@pytest.mark.parametrize("guesses", [1, 16])
+@pytest.mark.parametrize("guesses", [pytest.param(1, marks=pytest.mark.slow), 16])
 def test_opposite_direction_is_half_a_turn_away(guesses):
     """From upright, where each component of a cross product is zero; and the error of a frame that cannot turn."""
     model = jd.robots.iiwa()

@@ -10,7 +10,6 @@ import pytest
 from pinocchio_bridge import (
     as_dtype,
     assert_close,
-    load_robot,
     make_model,
     quick,
     random_inertia,
@@ -28,19 +27,13 @@ ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", 
 CASES = {
     "every_kind": lambda: random_tree(1, ALL_KINDS),
     "forest": lambda: random_tree(2, ALL_KINDS, parents=[-1, 0, 0, 2, -1, 4, 5, 4]),
-    "allegro": lambda: load_robot("allegro_hand_description/urdf/allegro_right_hand.urdf"),
-    "g1": lambda: load_robot("g1_description/urdf/g1_29dof_rev_1_0.urdf", floating=True),
 }
 
 
 @functools.cache
 def case(name):
-    made = CASES[name]()
-    if isinstance(made, tuple):
-        source, model, bridge = made
-    else:
-        model = made
-        source, bridge = to_pinocchio(model)
+    model = CASES[name]()
+    source, bridge = to_pinocchio(model)
     frames = [model.frame_names[i] for i in (0, len(model.frame_names) // 2, -1)]
     q, v, _, _, _ = random_states(model, 5, 3)
 

@@ -17,8 +17,6 @@ ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", 
 CASES = {
     "every_kind": lambda: random_tree(11, ALL_KINDS, armature=False),
     "forest": lambda: random_tree(12, ALL_KINDS, parents=[-1, 0, 0, 2, -1, 4, 5, 4], armature=False),
-    "panda": lambda: load_robot("panda_description/urdf/panda.urdf", lock=("finger",))[1],
-    "solo12": lambda: load_robot("solo_description/robots/solo12.urdf", floating=True)[1],
 }
 FEW = pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x != "forest")) for x in CASES])
 

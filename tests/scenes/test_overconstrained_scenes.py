@@ -195,26 +195,6 @@ def test_gradients(name):
     np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=1e-8 * np.abs(differences).max())
 
 
-@chosen()
-def test_a_batch_with_traced_starts(name):
-    """Three motions under jit: each the same as alone."""
-    one, times = mechanism(name), np.array([0.0, mechanism(name).span])
-    starts = [begin(one, scale) for scale in (1.0, 0.9, 1.1)]
-
-    def run(q, v):
-        motion = jd.simulate(one.scene, q, v, times, stepsize=within(1e-9))
-        return motion.q[-1], motion.success
-
-    q, success = jax.jit(jax.vmap(run))(*(jnp.stack(x) for x in zip(*starts, strict=True)))
-    assert bool(success.all())
-    for end, scale in zip(q, (1.0, 0.9, 1.1), strict=True):
-        start = np.asarray(one.x), scale * np.asarray(one.rate)
-        exact = one.states(one.minimal(times, 1e-13, start)[0])[0][-1]
-        assert distance(end, exact) < 1e-7
-    # Of two rows that are equally far from the others rounding decides which one is kept, and stages lie off the constraints.
-    assert distance(q[0], jd.simulate(one.scene, *starts[0], times, stepsize=within(1e-9)).q[-1]) < 1e-9
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
 def test_rows_that_lose_rank_on_the_way_are_exchanged(tolerance):
