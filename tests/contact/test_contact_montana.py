@@ -225,3 +225,12 @@ test_bad_input_is_refused = refusals(
         "relative curvature",
     ),
 )
+
+
+@pytest.mark.slow
+def test_float32_stays_float32():
+    kinematics = jd.contact.montana(
+        jd.contact.Sphere(jnp.float32(0.1)), jd.contact.Sphere(jnp.float32(0.02)), ETA.astype(jnp.float32)
+    )
+    assert kinematics.J_c.dtype == jnp.float32 == kinematics.forward.dtype
+    np.testing.assert_allclose(kinematics.J_c, sphere_J_c(0.1, 0.02, np.asarray(ETA)), atol=2e-5)

@@ -206,6 +206,20 @@ def test_rows_that_lose_rank_on_the_way_are_exchanged(tolerance):
     assert int(motion.stats["num_steps"]) < 20 and np.ptp(motion.energy) < 1e3 * tolerance
 
 
+@pytest.mark.slow
+def test_gradients_go_through_a_flat_position():
+    """Sarrus' linkage falls through its flat position: the energy at the end changes with the rate as that of the start."""
+    scene, (q, v) = jd.scenes.sarrus(), jd.scenes.sarrus.start(rate=-1.0)
+
+    def end(scale):
+        steps = jd.simulation.Steps(rtol=1e-11, atol=1e-11)
+        motion = jd.simulate(scene, q, scale * v, np.array([0.0, 1.0]), stepsize=steps, outputs=("energy",))
+        return motion.energy[-1]
+
+    start = jd.kinetic_energy(scene.system, q, v)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(1.0), 2 * start, rtol=1e-5)  # the passage costs digits
+
+
 def test_numbers_that_make_no_mechanism():
     for match, call in (
         ("length b must", lambda: jd.scenes.goldberg(lengths=(1.0, 1.0, 0.5))),

@@ -308,6 +308,48 @@ def test_a_closed_leg_hops_and_its_gradient():
     np.testing.assert_allclose(jnp.sum(gradient * direction), best, rtol=1e-8)
 
 
+@pytest.mark.slow
+def test_derivatives_are_those_of_differences():
+    """By state, torque, friction and the plane: rolling, sliding, and falling; second order by differences of the first."""
+    scene = ball.__wrapped__(0.3)
+    step = jd.stepper(scene, 0.01)
+    states = {
+        "slides": (jnp.asarray([0, 0, 0.1, 1, 0, 0, 0.0]), jnp.asarray([1.0, 0.2, -0.3, 0.1, 0.3, 0.2])),
+        "rolls": (jnp.asarray([0, 0, 0.1, 1, 0, 0, 0.0]), jnp.asarray([0.5, 0, -0.1, 0.1, 5.0, 0.2])),
+        "flies": (jnp.asarray([0, 0, 0.4, 1, 0, 0, 0.0]), jnp.asarray([1.0, 0.2, -0.3, 0.1, 0.3, 0.2])),
+    }
+    weights = np.arange(1.0, 14.0)
+
+    def value(x, q, v):
+        end = step((q, v + x[:6]), x[6:])
+        return jnp.sum(weights * jnp.concatenate(end))
+
+    gradient, jvp = jax.jit(jax.grad(value)), jax.jit(jax.jacfwd(value))
+    hessian = jax.jit(jax.hessian(value))
+    values, gradients = (jax.vmap(f, (0, None, None)) for f in (value, jax.grad(value)))
+    x, h = jnp.zeros(12), 1e-5
+    steps = h * jnp.eye(12)
+    for name, (q, v) in states.items():
+        expected = (values(steps, q, v) - values(-steps, q, v)) / (2 * h)
+        found = gradient(x, q, v)
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8, err_msg=name)
+        np.testing.assert_allclose(jvp(x, q, v), found, rtol=1e-10, atol=1e-12, err_msg=name)
+        second = (gradients(steps, q, v) - gradients(-steps, q, v)) / (2 * h)
+        np.testing.assert_allclose(hessian(x, q, v), second, rtol=1e-6, atol=1e-7, err_msg=name)
+
+    def of_friction(friction, height):
+        plane = jnp.eye(4).at[2, 3].set(height)
+        contact = jd.contact.ground_contact("body", None, friction, radius=0.1, plane=plane, name="0")
+        end = jd.stepper(jd.Scene(scene.system, forces=[contact]), 0.01)(states["slides"], STILL)
+        return jnp.sum(weights * jnp.concatenate(end))
+
+    found, h = jax.jit(jax.grad(of_friction, (0, 1)))(0.3, 0.001), 1e-6
+    places = np.array([0.3, 0.001]) + h * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    ends = jax.jit(jax.vmap(of_friction))(*places.T)
+    expected = (ends[0] - ends[1]) / (2 * h), (ends[2] - ends[3]) / (2 * h)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("smoothing", [0.0, 1e-3])
 def test_second_derivatives_where_the_rows_of_contacts_turn(smoothing):

@@ -228,6 +228,36 @@ def test_gradients():
 
 
 @pytest.mark.slow
+def test_slopes_of_a_lagrangian():
+    """dL/dv and dL/dq of a tree of all joints by automatic differentiation; of one system given in three ways."""
+    model = tree("free", "spherical", "planar", "revolute")
+    q, v = jd.random_configuration(model, jax.random.key(5)), jax.random.normal(jax.random.key(6), (model.nv,))
+
+    def lagrangian(v, shift):
+        at = jd.integrate(model, q, shift)
+        return jd.kinetic_energy(model, at, v) - jd.potential_energy(model, at)
+
+    want = quick(jax.grad(lagrangian, (0, 1)))(v, jnp.zeros(model.nv))
+    for got, expected in zip(
+        quick(lambda q, v: variational._lagrangian_derivatives(model, q, v, 0.0))(q, v), want, strict=True
+    ):
+        np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-11)
+
+    mass = lambda q: jnp.diag(1 + q**2)  # noqa: E731
+    potential = lambda q: jnp.sum(jnp.cos(q))  # noqa: E731
+    systems = (
+        jd.LagrangianSystem(lambda q, v: 0.5 * v @ mass(q) @ v - potential(q), 2),
+        jd.MetricSystem(mass, 2, potential=potential),
+        jd.ExplicitSystem(mass, lambda q, v: q * v * v - jnp.sin(q), 2),
+    )
+    q, v = jnp.array([0.3, -0.8]), jnp.array([1.1, 0.6])
+    for system in systems:
+        p, pull = variational._lagrangian_derivatives(system, q, v, jnp.asarray(0.0))
+        np.testing.assert_allclose(p, (1 + q**2) * v, rtol=1e-12)
+        np.testing.assert_allclose(pull, q * v * v + jnp.sin(q), rtol=1e-12)
+
+
+@pytest.mark.slow
 def test_float32(runs):
     """As exact as float64 up to rounding: 2e-4 after 800 steps, beside a method's error of 2e-4."""
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), scenes.pendulum_in_plane())
