@@ -285,8 +285,13 @@ def gear(joint_a: str, joint_b: str, ratio: Numbers, offset: Numbers = 0.0, *, n
         raise ValueError(f"gear: both joints are {joint_a!r}; name two different ones")
     name = check_new_name(name, f"gear {joint_a}-{joint_b}")
     what = f"{name!r}: "
-    joints = (check_name(joint, what + "joint") for joint in (joint_a, joint_b))
-    return Gear(name, *joints, as_float(ratio, what + "ratio", (), float), as_float(offset, what + "offset", (), float))
+    return Gear(
+        name,
+        check_name(joint_a, what + "joint_a"),
+        check_name(joint_b, what + "joint_b"),
+        as_float(ratio, what + "ratio", (), float),
+        as_float(offset, what + "offset", (), float),
+    )
 
 
 class JointLock(Constraint):

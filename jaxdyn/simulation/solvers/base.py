@@ -332,7 +332,7 @@ class ErrorMonitoredSteps(diffrax.ConstantStepSize):
 
     order: int | None = eqx.field(static=True)
 
-    def init(self, terms, t0, t1, y0: Any, dt0, args, func, error_order):
+    def init(self, terms, t0, t1, y0: Any, dt0: Any, args, func, error_order):
         """End of the first step; its number, the grid, the start, the sums of errors, and the greatest distances."""
         start, length = jax.lax.stop_gradient((y0, dt0))
         return t0 + length, (jnp.ones((), jnp.int32), (t0, length), start, *no_sums(y0))
