@@ -104,8 +104,8 @@ def trailers(theta):
         """No axle slips sideways: its speed is that of the last one and of the bars between them."""
         theta = q[2:]
         sideways = jnp.stack([jnp.sin(theta), -jnp.cos(theta)], 1)
-        ahead = jnp.arange(3)[:, None] < jnp.arange(3)
-        return jnp.concatenate([sideways, -ahead * jnp.cos(theta[:, None] - theta)], 1)
+        ahead = np.triu(np.ones((3, 3)), 1)
+        return jnp.concatenate([sideways, -ahead * jnp.cos(theta[:, None] - theta[None])], 1)
 
     return jd.reduction.involutive(jd.Scene(free(5), (jd.Pfaffian(rows),)), jnp.asarray([0.1, 0.2, *theta]))
 
