@@ -140,10 +140,9 @@ def constrained_dynamics(
 
 def _accelerate(rank_tol, scene: Scene, *state):
     """(a, lam, rank, result) by the kernel for rows of this number."""
-    # More rows than velocities are dependent at every state, and Cholesky would fail for all samples. As many rows leave no
-    # motion unless some repeat others, which the rank tells. A selection leaves independent rows and zeros in the place of the
-    # dropped ones, so that the count says nothing.
-    is_wide = layout(scene)[-1].end >= scene.nv and not has_selection(scene)
+    # If there are more rows than velocities, they are dependent at every state, and Cholesky would fail for all samples. A
+    # selection leaves independent rows and zeros in the place of the dropped ones, so that the count says nothing.
+    is_wide = layout(scene)[-1].end > scene.nv and not has_selection(scene)
     return (_by_columns if is_wide else _by_pivots)(rank_tol, scene, *state)
 
 
@@ -166,8 +165,9 @@ def _without_kernel(rank_tol, scene: Scene, q, v, tau, t):
 
 @kernel(static=1, fallback=_without_kernel)
 def _by_columns(rank_tol, scene: Scene, q, v, tau, t):
-    """`_by_rank`; samples are invalid where the pseudo-inverse is."""
+    """`_by_rank`; samples are invalid where the pseudo-inverse is, and where rows leave no motion unless they are rounded."""
     a, lam, rank, result = _by_rank(rank_tol, scene, q, v, tau, t)
+    a, lam = (mark_invalid(rank >= scene.nv, x) for x in (a, lam))
     return a, lam, rank, require_finite(result, a)
 
 
@@ -178,6 +178,9 @@ def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
     normal = cholesky(regular_gram(Y) if has_selection(scene) else matmul(Y.T, Y))
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
     lam, is_poor = _solve_with_refinement(normal, Y, deficit, quality, rank_tol)
+    if Y.shape[1] == Y.shape[0] and not has_selection(scene):
+        # Rows that leave no motion unless some repeat others: the fallback tells whether they do.
+        is_poor = is_poor | ~(quality > min_pivot(q, rank_tol))
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
     # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a
     # mass matrix that is not positive definite.
@@ -233,7 +236,7 @@ def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, deficit, 
     result = RESULTS.where(metric.is_definite(), result, RESULTS.singular_mass_matrix)
     a = metric.unwhiten(free + w)
     if is_standalone():  # exported code has no `result`; it returns a status, which invalid values set
-        a = mark_invalid(~(are_satisfied & is_clear & metric.is_definite()), a)
+        a = mark_invalid(~(are_satisfied & metric.is_definite()), a)
     return ConstrainedDynamics(a, lam, rank_of(Y, inverse).astype(jnp.int32), result, layout(scene))
 
 

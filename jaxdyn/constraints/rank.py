@@ -258,7 +258,16 @@ def has_clear_rank(
     The least singular value that counts has to be `MIN_GAP` times the largest that does not. Rows that leave no motion have to
     be independent beyond doubt: a row that differs from a combination of others by the rounding of its numbers leaves none, too.
     Those of functions, not of bodies whose geometry may have been typed with few digits, are taken as they stand: `is_exact`.
+    Kernels do not ask.
     """
+    return kernel(_take_as_clear, static=2, fallback=_has_gap, alone=False)(rank_tol, is_exact, None, A, inverse)
+
+
+def _take_as_clear(rank_tol, is_exact: bool, _, A, inverse):
+    return jnp.asarray(True)
+
+
+def _has_gap(rank_tol, is_exact: bool, _, A, inverse):
     (A, inverse), minimum = lax.stop_gradient((A, inverse)), tolerance(rank_tol, A)
     is_full = (rank_of(A, inverse) >= A.shape[1]) & (rank_tol is None and not is_exact and A.shape[0] >= A.shape[1])
 

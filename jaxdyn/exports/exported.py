@@ -333,8 +333,8 @@ def _make_caller(
 
     def fail():
         raise FloatingPointError(
-            f"{name}: no regular solution at this sample: constraint rows contradict each other or have no clear rank, the mass "
-            "matrix is singular, or a step cannot be completed; the result code of the function in Python says which"
+            f"{name}: no regular solution at this sample: constraint rows contradict each other, the mass matrix is "
+            "singular, or a step cannot be completed; the result code of the function in Python says which"
         )
 
     known = {

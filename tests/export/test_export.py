@@ -233,28 +233,6 @@ def test_rows_that_contradict_each_other_give_a_status(tmp_path):
     assert "1 where the sample has no regular solution" in (tmp_path / "crossing.h").read_text()
 
 
-def test_rows_without_a_clear_rank_give_a_status():
-    # Three rows whose singular values are 1, q0 and q1: the rank tolerance falls between two that differ by a factor of four.
-    A = np.eye(4)[:3]
-    rows = jd.Pfaffian(lambda q, t: A * jnp.stack([1 + 0 * t, q[0], q[1]])[:, None])
-    scene = jd.Scene(jd.LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 4), (rows,))
-
-    def motion(q):
-        return jd.constrained_dynamics(scene, jnp.asarray(q), jnp.zeros(4), jnp.ones(4))
-
-    exported = jd.export(lambda q: motion(q).acceleration, np.zeros(4), name="unclear")
-    for q1, result in ((3e-4, "successful"), (8e-10, "unclear_rank"), (1e-16, "successful")):
-        q = np.array([3e-9, q1, 0.0, 0.0])
-        for mode in ("auto", "plain"):
-            with jd.compilation(mode):
-                assert motion(q).result == getattr(jd.RESULTS, result), mode
-        if result == "successful":
-            np.testing.assert_allclose(exported(q), [0.0, 0.0, float(q1 < 1e-9), 1.0], atol=1e-12)
-        else:
-            with pytest.raises(FloatingPointError, match="have no clear rank"):
-                exported(q)
-
-
 def test_results_that_are_not_finite_have_a_status(tmp_path):
     exported = jd.export(lambda x: (jnp.log(x), 1 / x), np.zeros(2), name="f", batch=True)
     assert np.isinf(exported(np.zeros(2))[0]).all()
