@@ -162,7 +162,9 @@ def assemble(
     locked = add_constraints(scene, [lock_joint(*joint) for joint in hold.items()])
     if not layout(locked):  # raises for joints that do not exist
         none, zero = jnp.zeros(0, q.dtype), jnp.zeros((), q.dtype)
-        return Assembly(q, state[1], jnp.zeros(2, q.dtype), RESULTS.successful, zero, jnp.asarray(False), none, none, ())
+        return Assembly(
+            q, state[1], jnp.zeros(2, q.dtype), RESULTS.successful, zero, jnp.asarray(False), none, none, ()
+        )
     atol = None if atol is None else float(atol)
 
     def from_guess(q):

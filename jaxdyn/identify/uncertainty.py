@@ -193,17 +193,17 @@ def model_error_factors(logs: Sequence[Log], residuals: Sequence[np.ndarray]) ->
     # Logs are independent and add up.
     sizes = np.sum([len(residual) / _autocorrelation_times(residual) for residual in residuals], axis=0)
     factors = np.sqrt(np.maximum(sizes / (_STATES * len(residuals)), 1.0))
-    return np.where(is_white(logs, residuals), 1.0, factors)
+    return np.where(is_white(logs, residuals, 0.2), 1.0, factors)
 
 
-def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray:
+def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray], share: float = 0.5) -> np.ndarray:
     """Decide for each column of the residuals (n, k) of logs whether it has no more power at low frequencies than white noise.
 
     Bartlett's test, one-sided at the level 0.001: the cumulative periodogram of white noise exceeds a straight line by more than
-    sqrt(-log(0.001) / 2) / sqrt(m), m its number of frequencies, once in a thousand. Frequencies up to a fifth of the sampling
-    rate are compared, where the splines of `shift_torques` leave the power of noise within two per cent, and of a log that was
-    low-passed up to 0.6 of the cut-off, where the low-pass leaves it within a few. Noise of differentiated positions, which grows
-    with the frequency, counts as white.
+    sqrt(-log(0.001) / 2) / sqrt(m), m its number of frequencies, once in a thousand. Frequencies up to
+    `share` times the sampling rate are compared; up to a fifth, the splines of `shift_torques` leave the power of noise within
+    two per cent. Of a log that was low-passed these are frequencies up to 0.6 of the cut-off, where the low-pass leaves it
+    within a few. Noise of differentiated positions, which grows with the frequency, counts as white.
 
     Source: Bartlett (1955), "An introduction to stochastic processes"; Priestley (1981), section 6.2.6.
     """
@@ -212,7 +212,7 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray
         # A single sample has no rate, and no frequency but zero.
         rate = log_rate(log) or 1.0
         frequency = np.fft.rfftfreq(len(residual), 1 / rate)
-        maximum = min(rate / 5, np.inf if log.cutoff is None else 0.6 * log.cutoff)
+        maximum = min(share * rate, np.inf if log.cutoff is None else 0.6 * log.cutoff)
         # Offsets are fitted, so that the mean says nothing.
         band = (frequency > 0) & (frequency <= maximum)
         # As shares of each log's band: logs may differ in sampling, length and cut-off.

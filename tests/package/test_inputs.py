@@ -166,7 +166,7 @@ def test_functions_of_bodies_refuse_other_systems(name, call):
 @pytest.mark.parametrize(("name", "call"), OF_SCENES.items())
 def test_functions_of_a_scene_take_a_system_as_one(name, call):
     """With the same results, or the same refusal, as for `Scene(system)`."""
-    if name in ("constrained_dynamics", "simulate", "stiffness"):
+    if name in ("assemble", "constrained_dynamics", "simulate", "stiffness"):
         same(call[0](ARM, *call[1:]), call[0](jd.Scene(ARM), *call[1:]))
     else:
         with pytest.raises(ValueError, match="has no constraints"):
