@@ -224,7 +224,7 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray], share: float 
     # A single frequency cannot contradict white noise.
     if count < 2:
         return np.ones(power.shape[1], bool)
-    share = np.cumsum(power[np.argsort(place)], axis=0) / np.where(total > 0, total, 1)
-    excess = np.max(share - np.arange(1, count + 1)[:, None] / count, axis=0)
+    cumulative = np.cumsum(power[np.argsort(place)], axis=0) / np.where(total > 0, total, 1)
+    excess = np.max(cumulative - np.arange(1, count + 1)[:, None] / count, axis=0)
     # One-sided Kolmogorov-Smirnov bound: white noise exceeds x with the probability exp(-2 m x^2).
     return excess <= np.sqrt(-np.log(_LEVEL) / 2 / count)
