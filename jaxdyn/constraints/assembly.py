@@ -157,14 +157,13 @@ def assemble(
     scene, rank_tol = as_scene(scene), check_tolerance(rank_tol)
     check_search(steps, guesses, atol)
     hold = check_mapping(hold, "hold", '{"1": 0.5}')
-    state: Any = check_state(scene.system, q=q, v=zeros_if_none(v, scene.nv), t=t)
-    q, v, t = state
+    v = zeros_if_none(v, scene.nv)
+    q, v, t = check_state(scene.system, q=q, v=v, t=t)
     locked = add_constraints(scene, [lock_joint(*joint) for joint in hold.items()])
     if not layout(locked):  # raises for joints that do not exist
         none, zero = jnp.zeros(0, q.dtype), jnp.zeros((), q.dtype)
-        return Assembly(
-            q, state[1], jnp.zeros(2, q.dtype), RESULTS.successful, zero, jnp.asarray(False), none, none, ()
-        )
+        rest = RESULTS.successful, zero, jnp.asarray(False), none, none, ()
+        return Assembly(q, jnp.asarray(v), jnp.zeros(2, q.dtype), *rest)
     atol = None if atol is None else float(atol)
 
     def from_guess(q):

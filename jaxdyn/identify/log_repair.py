@@ -31,7 +31,7 @@ _FASTER, _FASTER_THAN_ALL, _BEYOND_LIMIT = 10.0, 5.0, 1.5
 # Least tolerance (rad) of the turn that a wrapped angle jumps by: resolution and noise of encoders.
 _TURN_TOLERANCE = 0.02
 # Share of the samples at a limit of a saturated sensor.
-_HELD = 0.02
+_SATURATED = 0.02
 _OUTLIERS = ("refuse", "drop", "keep")
 
 
@@ -136,23 +136,23 @@ def find_outliers(log: Log, model: Model | None = None) -> list[Outlier]:
     return found
 
 
-def check_held(log: Log, model: Model | None = None) -> list[str]:
+def check_saturation(log: Log, model: Model | None = None) -> list[str]:
     """Warning about torques that stay at their highest or lowest value, as those of a saturated sensor do.
 
     Two of a hundred samples are there for three samples or longer, and ten times as many as at the value next to it, which steps
     of a coarse sensor are not. Zero is no limit.
     """
 
-    def is_held(x: np.ndarray) -> bool:
+    def is_saturated(x: np.ndarray) -> bool:
         """Decide for the highest value."""
         top = x == x.max()
         others, counts = np.unique(x[~top], return_counts=True)
         # A torque of a few levels is one that is switched.
         if len(others) < 10 or x.max() == 0:
             return False
-        return bool(np.sum(top[:-2] & top[1:-1] & top[2:]) >= max(_HELD * len(x), 10 * counts[-1]))
+        return bool(np.sum(top[:-2] & top[1:-1] & top[2:]) >= max(_SATURATED * len(x), 10 * counts[-1]))
 
-    columns = [j for j, x in enumerate(np.asarray(log.tau, np.float64).T) if is_held(x) or is_held(-x)]
+    columns = [j for j, x in enumerate(np.asarray(log.tau, np.float64).T) if is_saturated(x) or is_saturated(-x)]
     names = ", ".join(_label(log, model, "tau", column).removeprefix("joint ") for column in columns)
     return (
         [f"torques of {names} stay at their largest value: is the sensor saturated? Leave such samples out"]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.log_repair import LogWarning, check_held, repair_log
+from jaxdyn.identify.log_repair import LogWarning, check_saturation, repair_log
 from jaxdyn.identify.logs import (
     Log,
     are_angles,
@@ -84,7 +84,7 @@ def from_raw(
         raise ValueError(f'cutoff is {cutoff!r}; give a frequency in Hz, or "auto"')
     # Before the filter, whose response would spread a corrupted sample over its neighbours.
     raw = repair_log(Log(t, q, tau=tau, joint_names=joint_names), model, unwrap=unwrap, outliers=outliers)
-    for line in check_held(raw, model):
+    for line in check_saturation(raw, model):
         warn(line, LogWarning)
     cutoff = choose_cutoff(raw).frequency if isinstance(cutoff, str) else cutoff
     t, q, tau = (np.asarray(x, np.float64) for x in (raw.t, raw.q, raw.tau))
@@ -352,7 +352,7 @@ def log_warnings(model: Model, log: Log, residual: np.ndarray) -> list[str]:
     return [
         *check_log_content(model, log, labels),
         *check_rest(log, residual, labels),
-        *check_explained(model, log, residual, labels),
+        *check_residual_power(model, log, residual, labels),
     ]
 
 
@@ -412,7 +412,7 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
             f"positions of {', '.join(wrong)} do not follow the velocities: check units, signs, the order of columns and the "
             "unit of time"
         )
-    return lines if log.cutoff is not None else [*lines, *check_held(log, model)]
+    return lines if log.cutoff is not None else [*lines, *check_saturation(log, model)]
 
 
 def _path_errors(t: np.ndarray, positions: np.ndarray, integrals: np.ndarray, is_angle: np.ndarray) -> np.ndarray:
@@ -421,13 +421,13 @@ def _path_errors(t: np.ndarray, positions: np.ndarray, integrals: np.ndarray, is
         return np.zeros(len(is_angle))
     steps, changes = np.diff(t), np.diff(positions, axis=0)
     # Logs of joints that turn without end may jump by a turn.
-    is_told = (steps <= _GAP * np.median(steps))[:, None] & ~(is_angle & (np.abs(changes) > np.pi))
-    off = np.cumsum(np.where(is_told, changes - np.diff(integrals, axis=0), 0.0), axis=0)
+    is_usable = (steps <= _GAP * np.median(steps))[:, None] & ~(is_angle & (np.abs(changes) > np.pi))
+    off = np.cumsum(np.where(is_usable, changes - np.diff(integrals, axis=0), 0.0), axis=0)
     line = np.stack([np.ones(len(off)), t[1:] - t[0]], axis=1)
     return np.sqrt(np.mean((off - line @ np.linalg.lstsq(line, off, rcond=None)[0]) ** 2, axis=0))
 
 
-def check_explained(model: Model, log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
+def check_residual_power(model: Model, log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
     """Warning about joints that move and whose errors (n, nv) have most of the power of the torque."""
     idle = idle_coordinates(model, [log])
     power, lost = (np.sum(np.asarray(x, np.float64) ** 2, axis=0) for x in (log.tau, residual))

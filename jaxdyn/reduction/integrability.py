@@ -1,6 +1,6 @@
 """Classification of constraints: integrability, and the spurious terms of their substitution into L."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -96,58 +96,71 @@ def involutive(
     maximum = scene.nv - (
         int(np.linalg.matrix_rank(A_holonomic, tol=1e-9 * np.abs(A_holonomic).max())) if A_holonomic.size else 0
     )
-    points = _points_around(scene, frame, q, t)
 
-    def climb(points, target=None):
-        """Ranks at the first two points by level, and singular values at the first; None where the second has none."""
-        # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
-        # bracketed with the others and spans nothing itself.
-        levels: tuple[tuple[tuple[int, int], ...], ...] = ()
-        new = np.asarray(_fields(scene, frame, points, t, levels), float)[..., :count]
-        spanned, ranks, evidence = new[..., :0], [], []
-        while True:
-            if not np.isfinite(new[0]).all():
+    def fields_at(points):
+        """Fields at configurations as a function of the levels of brackets; finite at the first configuration."""
+
+        def fields(levels):
+            values = np.asarray(_fields(scene, frame, points, t, levels), float)
+            if not np.isfinite(values[0]).all():
                 raise ValueError(
                     f"the rows have derivatives of order {len(levels)} that are not finite at q = {np.asarray(q).tolist()}; "
                     "choose another configuration"
                 )
-            if not np.isfinite(new).all():
-                return None
-            sizes = [np.linalg.svd(columns, compute_uv=False) for columns in np.concatenate([spanned, new], -1)[:2]]
-            evidence.append(sizes[0])
-            # A level spans that before. Much longer brackets raise the threshold, which must not take dimensions away again.
-            before = ranks[-1] if ranks else (0, 0)
-            ranks.append(tuple(max(int(np.sum(x > limit * x[0])), n) for x, n in zip(sizes, before, strict=True)))
-            if target is None:
-                # Every pass but the last adds a dimension, of which there are at most nq.
-                ends = len(ranks) > 1 and (ranks[-1] == before or max(ranks[-1]) >= maximum)
-            else:
-                ends = ranks[-1][0] >= target or len(ranks) == _LEVELS
-            if ends:
-                return ranks, tuple(evidence)
-            if target is None:
-                # With constant rank, the fields that are independent at a point span the level around it.
-                # Directions in the span already are removed once; pivoting, the largest first, then needs only the new columns.
-                inside, rest = spanned[1], new[1]
-                rest = rest - inside @ np.linalg.lstsq(inside, rest, rcond=None)[0] if inside.shape[1] else rest
-            else:
-                # Fields that depend on others at one point may not do so around it: those that are sums of others go.
-                rest = new.reshape(-1, new.shape[-1])
-            columns, pivots = pivot_rows(rest.T)
-            kept = columns[pivots > limit * sizes[1][0]].tolist()
-            spanned = np.concatenate([spanned, new[..., kept]], -1)
-            pairs = [(i, k) for k in kept for i in range(count + 1) if levels or i > k]  # [X_k, X_i] = -[X_i, X_k]
-            levels = (*levels, tuple(pairs))
-            new = np.asarray(_fields(scene, frame, points, t, levels), float)
+            return values
 
-    climbed = climb(points[:2]) or climb(points[[0, 0]])
-    assert climbed is not None  # the first point is finite, or an error was raised
-    ranks, evidence = climbed
+        return fields
+
+    points = _points_around(scene, frame, q, t)
+    growth = count, limit, maximum
+    grown = _grow(fields_at(points[:2]), *growth) or _grow(fields_at(points[[0, 0]]), *growth)
+    assert grown is not None  # the first configuration is finite, or an error was raised
+    ranks, evidence = grown
     dimension = max(ranks[-1])
     if any(here < around for here, around in ranks):
-        ranks, evidence = climb(points, dimension) or climbed
+        ranks, evidence = _grow(fields_at(points), *growth, target=dimension) or grown
     at_q = tuple(here for here, _ in ranks)
     return Involutivity(dimension == at_q[0], at_q, evidence, at_q[-1] == dimension)
+
+
+def _grow(fields: Callable, count: int, limit: float, maximum: int, target: int | None = None):
+    """Ranks by level at the first two configurations, and singular values at the first; None where fields are not finite.
+
+    **Arguments:** `fields(levels)` (points, nq, n): the last level of brackets; `count` of the fields that span the distribution;
+    `limit`: singular values below this share of the largest are zero; `maximum` of the ranks; `target`: the rank at the first
+    configuration that ends the search there, None for a search until ranks stop growing.
+    """
+    # A level is a tuple of pairs (i, k), for [X_i, Y_k] with Y_k of the level before; X_count is the drift, which is
+    # bracketed with the others and spans nothing itself.
+    levels: tuple[tuple[tuple[int, int], ...], ...] = ()
+    new = fields(levels)[..., :count]
+    spanned, ranks, evidence = new[..., :0], [], []
+    while np.isfinite(new).all():
+        sizes = [np.linalg.svd(columns, compute_uv=False) for columns in np.concatenate([spanned, new], -1)[:2]]
+        evidence.append(sizes[0])
+        # A level spans that before. Much longer brackets raise the threshold, which must not take dimensions away again.
+        before = ranks[-1] if ranks else (0, 0)
+        ranks.append(tuple(max(int(np.sum(x > limit * x[0])), n) for x, n in zip(sizes, before, strict=True)))
+        if target is None:
+            # Every pass but the last adds a dimension, of which there are at most nq.
+            ends = len(ranks) > 1 and (ranks[-1] == before or max(ranks[-1]) >= maximum)
+            # With constant rank, the fields that are independent at a point span the level around it.
+            # Directions in the span already are removed once; pivoting, the largest first, then needs only the new columns.
+            inside, rest = spanned[1], new[1]
+            rest = rest - inside @ np.linalg.lstsq(inside, rest, rcond=None)[0] if inside.shape[1] else rest
+        else:
+            ends = ranks[-1][0] >= target or len(ranks) == _LEVELS
+            # Fields that depend on others at one point may not do so around it: those that are sums of others go.
+            rest = new.reshape(-1, new.shape[-1])
+        if ends:
+            return ranks, tuple(evidence)
+        columns, pivots = pivot_rows(rest.T)
+        kept = columns[pivots > limit * sizes[1][0]].tolist()
+        spanned = np.concatenate([spanned, new[..., kept]], -1)
+        pairs = [(i, k) for k in kept for i in range(count + 1) if levels or i > k]  # [X_k, X_i] = -[X_i, X_k]
+        levels = (*levels, tuple(pairs))
+        new = fields(levels)
+    return None
 
 
 def _generators(scene, frame):

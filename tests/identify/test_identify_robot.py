@@ -12,7 +12,7 @@ from benchmarks.identify_selection import motion as random_motion
 from jaxdyn import identify, inertia
 from jaxdyn.cli.identify_tables import payload_text
 from jaxdyn.identify.condensed_fit import Setting, eliminate, fit_blocks, share_of_extra
-from jaxdyn.identify.log_repair import check_held
+from jaxdyn.identify.log_repair import check_saturation
 from jaxdyn.identify.logs import filter_like_log, idle_coordinates, motion_paths, samples_for_jumps
 from jaxdyn.identify.raw_logs import check_log_content, check_rest, motion_band, vibration
 from jaxdyn.identify.regression import block_slices, condense_model
@@ -725,7 +725,7 @@ def test_saturated_torques_are_named():
         identify.from_raw(log.t, log.q, clipped.tau)
     step = np.ptp(log.tau, axis=0) / 20
     for tau in (step * np.round(log.tau / step), np.maximum(log.tau, 0)):
-        assert check_held(identify.Log(log.t, log.q, log.v, log.a, tau)) == []
+        assert check_saturation(identify.Log(log.t, log.q, log.v, log.a, tau)) == []
 
 
 def test_torques_that_no_fit_explains_are_named(truth):
