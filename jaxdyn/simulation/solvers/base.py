@@ -190,7 +190,7 @@ ALLOWED = 0.1
 # Entries of a state that are no motion: constants of a step, and what nothing depends on.
 _NO_MOTION = ("frame", "held", "work", "slip")
 # Control of the step length by the last error alone (Hairer, Norsett & Wanner 1993, section II.4): the next step aims at an error
-# of _SAFETY^order of the tolerance, and is at most _MOST_FACTOR times as long, at least _LEAST_FACTOR times.
+# of _SAFETY^order of the tolerance, and is at most _MAX_FACTOR times as long, at least _MIN_FACTOR times.
 _SAFETY, _MIN_FACTOR, _MAX_FACTOR = 0.9, 0.2, 10.0
 
 
