@@ -31,7 +31,6 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import linkages
-from jaxdyn.constraints.base import position_residual
 from jaxdyn.constraints.loops import Loop
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
@@ -175,7 +174,7 @@ def motion_of(name: str, path: Path, scene, html: Path, duration: float) -> tupl
     loops = number_of_loops(scene)
     sizes = (name, scene.nv, f"{loops} + {len(scene.constraints) - loops}")
     q = scene.starts["reference"].q
-    gap = float(np.abs(position_residual(scene, q, jnp.asarray(0.0))).max())
+    gap = float(np.abs(jd.constraints.position_residual(scene, q, jnp.asarray(0.0))).max())
     began = time.perf_counter()
     try:
         start = jd.assemble(scene, q)

@@ -4,13 +4,12 @@ import jax
 import jax.numpy as jnp
 
 import jaxdyn as jd
-from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.systems.system import velocity_to_rate
 
 
 def admissible(scene, q, chosen, values):
     """The velocity with A v = 0 whose entries `chosen` are `values`: as many as the rows leave free."""
-    A = jax.jacfwd(lambda v: velocity_residual(scene, q, v))(jnp.zeros(scene.nv))
+    A = jax.jacfwd(lambda v: jd.constraints.velocity_residual(scene, q, v))(jnp.zeros(scene.nv))
     matrix = jnp.concatenate([A, jnp.eye(scene.nv)[chosen]])
     return jnp.linalg.solve(matrix, jnp.concatenate([jnp.zeros(A.shape[0]), values]))
 

@@ -17,3 +17,9 @@ def central_difference(function, point, step=1e-4):
     values = np.asarray(function(jnp.asarray((point + offsets).reshape(-1, point.size))))
     one, minus, two, minus_two = values.reshape(4, point.size, *values.shape[1:])
     return (8 * (one - minus) - (two - minus_two)) / (12 * step)
+
+
+def largest_residuals(scene, q, v, t=0.0):
+    """Largest residuals of the positions and of the velocities by the constraints, (2,)."""
+    parts = jd.constraints.position_residual(scene, q, t), jd.constraints.velocity_residual(scene, q, v, t)
+    return jnp.stack([jnp.max(jnp.abs(part), initial=0.0) for part in parts])

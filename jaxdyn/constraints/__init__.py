@@ -6,6 +6,8 @@ from jaxdyn.constraints.base import Constraint as Constraint
 from jaxdyn.constraints.base import Holonomic as Holonomic
 from jaxdyn.constraints.base import Pfaffian as Pfaffian
 from jaxdyn.constraints.base import constraint_jacobian as constraint_jacobian
+from jaxdyn.constraints.base import position_residual as position_residual
+from jaxdyn.constraints.base import velocity_residual as velocity_residual
 from jaxdyn.constraints.dynamics import projections as projections
 from jaxdyn.constraints.dynamics import second_fundamental_form as second_fundamental_form
 from jaxdyn.constraints.frames import body_wrenches as body_wrenches

@@ -242,8 +242,18 @@ def nonholonomic_rows(places: Sequence[Layout]) -> np.ndarray:
 
 
 def position_residual(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, " nh"]:
-    """phi(q, t) of all holonomic parts, stacked in the scene's order; (0,) when there are none."""
-    return _position_residual(scene, q, jnp.asarray(t, q.dtype))
+    r"""Residuals phi(q, t) of all holonomic parts, in the scene's order: zero where the constraints are closed.
+
+    **Arguments:** `q` (nq,); `t`, s.
+
+    **Returns:** (nh,), m or rad by the constraint; (0,) of a scene without holonomic parts.
+
+    **Raises:** ValueError for constraints that do not fit the system.
+
+    Source: EQUATIONS section 7.
+    """
+    scene = as_scene(scene)
+    return _position_residual(scene, *check_state(scene.system, q=q, t=t))
 
 
 @kernel
@@ -264,8 +274,21 @@ def _drop(scene: Scene, values, places: Callable | None = None):
 def velocity_residual(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
-    """psi(q, v, t) = A v - b of all constraints, (nc,)."""
-    return _velocity_residual(scene, q, v, jnp.asarray(t, q.dtype))
+    r"""Residuals of the velocities by all constraints, in the order of `constraint_jacobian`: zero for admissible ones.
+
+    $$\psi(q, v, t) = A v - b$$
+
+    **Arguments:** `q` (nq,), `v` (nv,); `t`, s.
+
+    **Returns:** (nc,), m/s or rad/s by the constraint; (0,) of a scene without constraints.
+
+    **Raises:** ValueError for constraints that do not fit the system.
+
+    Source: EQUATIONS section 7.
+    """
+    scene = as_scene(scene)
+    q, v, t = check_state(scene.system, q=q, v=v, t=t)
+    return _velocity_residual(scene, q, v, t) if scene.constraints else jnp.zeros((0,), q.dtype)
 
 
 @kernel

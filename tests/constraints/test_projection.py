@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from jax import lax
 from jax.flatten_util import ravel_pytree
+from motion_helpers import largest_residuals
 from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from benchmarks.report_cases import test_set
 from jaxdyn import scenes
 from jaxdyn.constraints import projection
-from jaxdyn.constraints.assembly import residuals
-from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
+from jaxdyn.constraints.base import holonomic_rows, layout
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.systems.system import displace, retract
@@ -45,19 +45,19 @@ def in_fixed_steps(rank_tol, scene, q, v, t):
     if holonomic.size:
 
         def move(place, _):
-            step = jnp.matmul(B_holonomic, position_residual(scene, place, t))
+            step = jnp.matmul(B_holonomic, jd.constraints.position_residual(scene, place, t))
             return displace(scene.system, place, -step), None
 
         moved, _ = lax.scan(move, q, None, length=4)
-        before, after = (position_residual(scene, x, t) for x in (q, moved))
+        before, after = (jd.constraints.position_residual(scene, x, t) for x in (q, moved))
         better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
         q = jnp.where(better, retract(scene.system, moved), q)
 
     def slow(v, _):
-        return v - jnp.matmul(B, velocity_residual(scene, q, v, t)), None
+        return v - jnp.matmul(B, jd.constraints.velocity_residual(scene, q, v, t)), None
 
     projected, _ = lax.scan(slow, v, None, length=4)
-    before, after = (velocity_residual(scene, q, x, t) for x in (v, projected))
+    before, after = (jd.constraints.velocity_residual(scene, q, x, t) for x in (v, projected))
     better = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
     return q, jnp.where(better, projected, v)
 
@@ -80,7 +80,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
         computed = project_state(scene, q, v, zero, rank_tol)
         fixed = in_fixed_steps(rank_tol, scene, q, v, zero)
         M, A = jd.mass_matrix(scene.system, computed[0]), jd.constraint_jacobian(scene, computed[0])
-        return computed, fixed, residuals(scene, *computed), (M, A)
+        return computed, fixed, largest_residuals(scene, *computed), (M, A)
 
     (place, speed), fixed, left, (M, A) = quick(jax.vmap(both))(q, v)
     assert float(jnp.max(left)) < 1e-14 * (1 + float(jnp.max(jnp.abs(speed))))
@@ -142,7 +142,7 @@ def test_what_a_projection_leaves_open_is_an_error(mode):
 
     def one(off):
         q1, v1, (error, _), _ = project_step(scene, q + off, v, jnp.asarray(0.0), (none, none))
-        return jnp.max(jnp.abs(error)), residuals(scene, q1, v1)[0], jnp.max(jnp.abs(q1 - q - off))
+        return jnp.max(jnp.abs(error)), largest_residuals(scene, q1, v1)[0], jnp.max(jnp.abs(q1 - q - off))
 
     error, left, moved = map(np.asarray, jax.jit(jax.vmap(one))(off))
     assert left[0] < 1e-15

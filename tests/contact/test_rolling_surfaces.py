@@ -13,7 +13,7 @@ from test_contact_montana import PAIRS as ALL_PAIRS
 
 import jaxdyn as jd
 from jaxdyn import scenes, se3
-from jaxdyn.constraints.base import position_residual, rows
+from jaxdyn.constraints.base import rows
 
 PAIRS = {name: pair for name, pair in ALL_PAIRS.items() if name != "sphere on sphere"}
 PAIRS["plane on ellipsoid"] = (TIP, jd.contact.Plane())
@@ -230,7 +230,9 @@ def test_assembly_from_far_away_ends_where_the_surfaces_touch():
     assert bool(system.is_consistent(found.q))
     np.testing.assert_allclose(found.q, system.place(found.q[:7]), atol=1e-14)
     # By the searched places and not by those of the assembly.
-    search = quick(lambda e: position_residual(scene, system.place(jd.integrate(system, guess, e)[:7]), 0.0)[0])
+    search = quick(
+        lambda e: jd.constraints.position_residual(scene, system.place(jd.integrate(system, guess, e)[:7]), 0.0)[0]
+    )
     e, steps = jd.difference(system, guess, found.q), 1e-4 * np.eye(6)
     gradient = (
         np.array([8 * (search(e + d) - search(e - d)) - search(e + 2 * d) + search(e - 2 * d) for d in steps]) / 12e-4

@@ -11,7 +11,6 @@ from scipy.optimize import lsq_linear
 
 import jaxdyn as jd
 from jaxdyn import scenes
-from jaxdyn.constraints.base import position_residual
 from jaxdyn.contact.qp import minimize_in_box
 
 RNG = np.random.default_rng(4)
@@ -207,7 +206,7 @@ def test_four_bar_by_its_crank():
     )(q0)
     q, v = plan.xs
     assert abs(q[-1, 0] - 1.5) < 0.02 and np.abs(v[-1]).max() < 0.3
-    assert np.abs(jax.vmap(lambda q: position_residual(scene, q))(q)).max() < 1e-10
+    assert np.abs(jax.vmap(lambda q: jd.constraints.position_residual(scene, q))(q)).max() < 1e-10
 
 
 @pytest.mark.long

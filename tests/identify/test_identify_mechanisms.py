@@ -9,7 +9,6 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.cli import main
-from jaxdyn.constraints.base import position_residual
 from jaxdyn.identify.linear_fit import fit_mechanism
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.result import Segments, simulate_segment
@@ -370,7 +369,7 @@ def test_an_exciting_motion_of_the_motors_of_a_five_bar(tmp_path):
     assert log.joint_names == motors and log.tau.shape == (601, 2) and whole.q.shape == (601, 4)
     assert np.abs(log.v).max(axis=0)[0] <= 0.9 * 1.5 * (1 + 1e-6) and np.abs(log.tau).max() <= 27.0 * (1 + 1e-6)
     assert np.abs(log.v[0]).max() < 1e-10  # starts at rest
-    closed = jax.jit(jax.vmap(lambda q: position_residual(scene, q)))(whole.q)
+    closed = jax.jit(jax.vmap(lambda q: jd.constraints.position_residual(scene, q)))(whole.q)
     np.testing.assert_allclose(closed, 0.0, atol=1e-12)
     measured = {name: (log.q[:, i], log.v[:, i], log.a[:, i]) for i, name in enumerate(motors)}
     completed = jd.identify.complete_log(scene, log.t, measured, whole.tau, whole.q[0])

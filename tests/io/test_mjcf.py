@@ -14,7 +14,6 @@ from loading import silent
 from mujoco_bridge import APART, Oracle, agreement
 
 import jaxdyn as jd
-from jaxdyn.constraints.base import position_residual
 
 MIXED = """
 <mujoco model="mixed">
@@ -180,7 +179,7 @@ def test_equalities_with_the_world_with_sites_and_within_a_body(tmp_path):
     assert any("inside" in line for line in scene.not_taken)
     assert any("mocap bodies" in line for line in scene.not_taken)
     q = scene.starts["reference"].q
-    residuals = np.abs(position_residual(scene, q, jnp.asarray(0.0)))
+    residuals = np.abs(jd.constraints.position_residual(scene, q, jnp.asarray(0.0)))
     assert np.delete(residuals, np.s_[6:12]).max() < 1e-15
     assert residuals[6:12].max() > 0.1  # nothing says that a file's sites meet
 

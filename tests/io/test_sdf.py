@@ -11,7 +11,6 @@ from pinocchio_bridge import quick
 from scipy.linalg import expm
 
 import jaxdyn as jd
-from jaxdyn.constraints.base import position_residual
 from jaxdyn.constraints.loops import JointLock
 from jaxdyn.model import host_math
 
@@ -540,7 +539,7 @@ def test_cassies_loops_close_from_a_rough_guess(robots_dir, name):
     scene = silent(cassie(robots_dir, name))
     rough = jnp.asarray(0.1 * np.random.default_rng(0).normal(size=scene.nv))
     assembly = jd.assemble(scene, jd.integrate(scene.system, scene.starts["reference"].q, rough), throw=False)
-    counted = (1 - assembly.dropped) * position_residual(scene, assembly.q, 0.0)
+    counted = (1 - assembly.dropped) * jd.constraints.position_residual(scene, assembly.q, 0.0)
     assert np.abs(counted).max() < 1e-13
     # Rows that repeat others but for the digits of the file stay open: by 1e-10 m in cassie_v2.sdf.
     assert assembly.gaps.max() < 5e-10

@@ -73,12 +73,14 @@ OF_SCENES = {
     "constraint_jacobian": (jd.constraint_jacobian, Q),
     "gauge_invariant": (lambda s, q, v, tau: jd.reduction.gauge_invariant(s, q, v, tau).acceleration, Q, V, A),
     "involutive": (lambda s, q: jd.reduction.involutive(s, q).singular_values, Q),
+    "position_residual": (jd.constraints.position_residual, Q),
     "projections": (jd.constraints.projections, Q),
     "reduced_dynamics": (lambda s, q, nu, tau: jd.reduced_dynamics(s, q, nu, tau, basis=(0,)).acceleration, Q, NU, A),
     "second_fundamental_form": (jd.constraints.second_fundamental_form, Q, V),
     "simulate": (lambda s, q, v: jd.simulate(s, q, v, [0, 1], stepsize=0.5, throw=False).v, [0, 0], [0, 0]),
     "stiffness": (jd.stiffness, Q, V),
     "tangent_basis": (jd.reduction.tangent_basis, Q),
+    "velocity_residual": (jd.constraints.velocity_residual, Q, V),
 }
 TAKES = [
     *((name, ARM, *call) for name, call in (OF_BODIES | OF_SYSTEMS).items()),
@@ -166,7 +168,7 @@ def test_functions_of_bodies_refuse_other_systems(name, call):
 @pytest.mark.parametrize(("name", "call"), OF_SCENES.items())
 def test_functions_of_a_scene_take_a_system_as_one(name, call):
     """With the same results, or the same refusal, as for `Scene(system)`."""
-    if name in ("assemble", "constrained_dynamics", "simulate", "stiffness"):
+    if name in ("assemble", "constrained_dynamics", "position_residual", "simulate", "stiffness", "velocity_residual"):
         same(call[0](ARM, *call[1:]), call[0](jd.Scene(ARM), *call[1:]))
     else:
         with pytest.raises(ValueError, match="has no constraints"):

@@ -10,8 +10,6 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn import scenes
-from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.model.topology import velocity_indices
 
 
 def four_bar():
@@ -81,12 +79,12 @@ def test_inverse_of_constrained_dynamics(case):
         force = scene.applied_force(q, v)
         left = jd.inverse_dynamics(scene.system, q, v, inverse.acceleration) - (0 if force is None else force)
         left = left - jd.constraint_jacobian(scene, q).T @ inverse.multipliers - inverse.tau
-        return inverse, forward, velocity_residual(scene, q, v), left
+        return inverse, forward, jd.constraints.velocity_residual(scene, q, v), left
 
     inverse, forward, slip, left = compute(scene, q, speed, rate)
     assert inverse.result == jd.RESULTS.successful
     size = float(jnp.max(jnp.abs(inverse.tau)))
-    places = list(velocity_indices(scene.system, motors)) if isinstance(motors[0], str) else motors
+    places = [scene.system.v_index(name) for name in motors] if isinstance(motors[0], str) else motors
     chosen = places if independent is None else independent
     np.testing.assert_array_equal(inverse.tau[jnp.asarray(places)], inverse.torques)
     assert_close(inverse.velocity[jnp.asarray(chosen)], speed, 1e-12)
@@ -104,13 +102,13 @@ def test_torques_of_a_delta_robot_are_those_of_virtual_work():
     point, velocity = jnp.array([0.05, -0.03, -0.65]), jnp.array([0.3, 0.2, -0.1])
     q = jd.assemble(scene, guess, hold=dict(zip("xyz", np.asarray(point), strict=True))).q
     names = [f"hip{i}" for i in range(3)]
-    hips = np.asarray(q)[velocity_indices(scene.system, names)]
+    hips = np.asarray(q)[[scene.system.v_index(name) for name in names]]
     np.testing.assert_allclose(hips, delta_hips(point), atol=1e-12)
     path = lambda s: delta_hips(point + s * velocity)  # noqa: E731
     rate = jax.jacfwd(path)
     speed, acceleration = rate(0.0), jax.jacfwd(rate)(0.0)
     inverse = jd.constrained_inverse_dynamics(scene, q, speed, acceleration, motors=names)
-    place = jnp.asarray(velocity_indices(scene.system, list("xyz")))
+    place = jnp.asarray([scene.system.v_index(name) for name in "xyz"])
     assert_close(inverse.velocity[place], velocity, 1e-10)
     np.testing.assert_allclose(inverse.acceleration[place], 0.0, atol=1e-10)
     # For any admissible velocity u: u . tau = u . (M a + h), by the Jacobian of the closed form.

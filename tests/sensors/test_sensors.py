@@ -65,11 +65,9 @@ def test_mujoco_reads_the_same(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     from mujoco_bridge import Oracle
 
-    from jaxdyn.io import NotTakenWarning
-
     path = tmp_path / "robot.xml"
     path.write_text(FILE)
-    with pytest.warns(NotTakenWarning, match="sensors: now"):
+    with pytest.warns(jd.io.NotTakenWarning, match="sensors: now"):
         scene = jd.load(path)
     oracle = Oracle(path, scene.system)
     rng = np.random.default_rng(1)

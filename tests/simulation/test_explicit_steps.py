@@ -12,7 +12,6 @@ import jaxdyn as jd
 from benchmarks.report_cases import cases, test_set
 from jaxdyn import scenes
 from jaxdyn.compile import kernels
-from jaxdyn.constraints.base import velocity_residual
 
 pytestmark = pytest.mark.native
 
@@ -54,7 +53,9 @@ def batch(scene, start, size=3):
     """States close to a start, and programs of their motions: both ways, without a cache between them."""
     q, v = (jnp.asarray(x, float) for x in start)
     # Of constraints that move with time, only the velocity as it is satisfies them.
-    moving = bool(scene.constraints) and bool(jnp.any(velocity_residual(scene, q, jnp.zeros_like(v)) != 0))
+    moving = bool(scene.constraints) and bool(
+        jnp.any(jd.constraints.velocity_residual(scene, q, jnp.zeros_like(v)) != 0)
+    )
     spread = 0.0 if moving else 0.01
     vs = v[None] * (1 + spread * jnp.arange(float(size))[:, None])
     ts = jnp.linspace(0.0, 0.4, 5)
