@@ -83,7 +83,8 @@ ADVICE = {
     "unordered_times": "give times ts that increase from each to the next",
     "bad_stepsize": "give a positive stepsize (s); for a sampled control, a whole part of its period",
     "bad_tolerance": "give finite rtol and atol that are not negative",
-    "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
+    "nonfinite_state": "take a smaller stepsize, lower the gains of a sampled control or its period, or look for a singular mass "
+    "matrix or a force that is not finite",
     "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.solvers.Rodas5P(); "
     "beyond some 1e5 steps, float64",
     "coarse_start": "subtract whole turns from q0, use float64, or take fixed steps",
@@ -219,23 +220,23 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
 
 def _advice(name: str, solution: Solution, scene: Scene, control, options) -> str:
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options._asdict())
-    # The scene may have become stiff on the way, so that the choice of the solver at the start has not seen it.
-    if name == "max_steps_reached":
+    # The scene may have become stiff on the way, so that the choice of the solver at the start has not seen it. Fixed steps that
+    # are too long leave the motion, so that only its start tells.
+    if name in ("max_steps_reached", "nonfinite_state", "coarse_steps"):
         import diffrax
 
         from jaxdyn.simulation.solvers.choice import innermost, stiff_rates
 
-        last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
-        state = solution.q[last], solution.v[last], solution.ts[last]
+        row = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1]) if name == "max_steps_reached" else 0
+        state = solution.q[row], solution.v[row], solution.ts[row]
         span = float(solution.ts[-1]) - float(solution.ts[0])
-        # Solvers by default are explicit.
-        is_explicit = options.solver is None or isinstance(innermost(options.solver), diffrax.AbstractERK)
+        is_default = options.solver is None and solution.solver in ("Dopri8", "RK4")
+        is_explicit = is_default or isinstance(innermost(options.solver), diffrax.AbstractERK)
         rates = stiff_rates(scene, *state, at_start(control, *state), span) if is_explicit else None
         if rates is not None:
             advice = (
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
-                f"{float(rates.explicit_step):.3g} s; pass solver=jd.solvers.Rodas5P(), or "
-                f"raise max_steps (now {options.max_steps})"
+                f"about {float(rates.explicit_step):.3g} s; pass solver=jd.solvers.Rodas5P(), else {advice}"
             )
     slides = any(isinstance(force, SlidingFriction) for force in scene.forces)
     if name in ("max_steps_reached", "too_many_events") and slides:

@@ -331,6 +331,19 @@ def test_default_solver_and_advice_follow_stiffness():
         run(1e9, solver=diffrax.Dopri8())
 
 
+def test_advice_for_fixed_steps_names_the_decay():
+    """Friction of a URDF on a link of 1e-4 kg m² decays at 0.3 / (0.01 * 1e-4) per second: steps of 1 ms are unstable."""
+    builder = jd.ModelBuilder("wrist", gravity=(0.0, 0.0, 0.0))
+    builder.add_body("flange", None, "revolute", (0.1, (0.0, 0.0, 0.0), (1e-4, 1e-4, 1e-4)), axis=(0, 0, 1))
+    scene = jd.Scene(builder.build(), forces=(jd.forces.CoulombFriction(0.3, 0.01),))
+    hold = jd.Sampled(lambda q, v, t: 0.5 - q, None, 0.002)
+    start, ts = (jnp.zeros(1), jnp.zeros(1)), jnp.linspace(0.0, 0.1, 3)
+    with pytest.raises(RuntimeError, match=r"stiff: the fastest decay is 3e\+05 1/s.*Rodas5P"):
+        jd.simulate(scene, *start, ts, control=hold, stepsize=0.001)
+    # Implicit steps need no such advice, and have none.
+    jd.simulate(scene, *start, ts, control=hold, stepsize=0.001, solver=jd.solvers.Rodas5P(), throw=False)
+
+
 @pytest.mark.long
 def test_implicit_explicit_split():
     """A released spring with twice the critical damping, decays of 3e2 to 4e3 1/s: springs and dampers are implicit."""
