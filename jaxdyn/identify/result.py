@@ -20,6 +20,7 @@ from jaxdyn.identify.mechanisms import FitSystem, Measured, build_scene, motor_b
 from jaxdyn.identify.regression import torque_error
 from jaxdyn.identify.torque_terms import ExtraTorque, Friction, friction_of, smoothing_by_filter
 from jaxdyn.model.arguments import Checked, Number, state_dtype
+from jaxdyn.model.description import short, table
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.options import pack_steps
 from jaxdyn.simulation.run import simulate
@@ -324,6 +325,14 @@ class Fit(Outcome):
     sigma: float | None = None
     extra: ExtraTorque | None = None
     as_measured: bool = eqx.field(static=True, default=False)
+
+    def __str__(self) -> str:
+        half = np.full(len(self.names), np.nan) if self.deviation is None else self.factor * self.deviation
+        columns = zip(self.names, self.nominal_values, self.values, half, strict=True)
+        rows = [[name, *(short(float(x)) for x in numbers)] for name, *numbers in columns]
+        losses = [short(float(loss)) for loss in (self.history[0], self.history[-1])]
+        head = f"Fit: {self.method}, {self.result.message}, loss {' to '.join(losses)} in {len(self.history) - 1} steps"
+        return f"{head}\n{table(['number', 'nominal', 'fitted', '+- 95 %'], rows)}"
 
     @property
     def scene(self) -> Scene:

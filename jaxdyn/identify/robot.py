@@ -25,6 +25,7 @@ from jaxdyn.identify.robot_logs import RobotLogs, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, improving_torques, search, splits
 from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, TorqueTerm, candidates, check_terms, split_terms
 from jaxdyn.model.arguments import Checked, Numbers, deprecated, warn
+from jaxdyn.model.description import short, table
 from jaxdyn.model.tree import Model
 from jaxdyn.tasks import DaskClient, open_engine
 
@@ -188,6 +189,13 @@ class RobotFit(eqx.Module):
     intervals: Intervals
     terms: tuple
     delays: Delays | None = None
+
+    def __str__(self) -> str:
+        base, factor, setting = self.intervals.base, self.intervals.factor, self.choice.setting
+        columns = zip(base.names, base.values, base.std, base.sources, strict=True)
+        rows = [[name, short(float(x)), short(factor * float(std)), source] for name, x, std, source in columns]
+        chosen = ", ".join(f"{name} {value}" for name, value in setting._asdict().items())
+        return f"{str(self.fit).splitlines()[0]}\n{chosen}\n{table(['combination', 'fitted', '+- 95 %', 'from'], rows)}"
 
     def align(self, log: Log) -> Log:
         """Shift the torques of a log of this robot by the delays, as for the fit, before `fit.torques` and `fit.error`."""

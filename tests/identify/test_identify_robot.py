@@ -167,6 +167,12 @@ def test_terms_that_are_there_are_recovered(truth):
     np.testing.assert_allclose(base.values(fit.fit.vector), base.values(truth), atol=1e-4)
     assert fit.fit.error(log(3)) < 1e-2
     assert fit.fit.extra.by_term["cable"] == pytest.approx([0.3, -0.2], abs=1e-4)
+    # Printed: a line on the fit, one on the setting, the header, and a line for each base parameter.
+    head, _, *lines = str(fit).splitlines()
+    assert head.startswith("Fit: torque fit by newton, successful, loss ") and len(lines) == 1 + len(
+        fit.intervals.base.names
+    )
+    assert len(str(fit.fit).splitlines()) == 2 + len(fit.fit.names)
 
 
 def test_load_dependent_friction_follows_the_fitted_robot(truth):
