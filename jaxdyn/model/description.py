@@ -44,8 +44,13 @@ def scene_lines(scene) -> str:
         for one in scene.constraints
     ]
     # A static wrapper shows the name of the function that it holds.
-    named = [(getattr(force, "function", None), type(force).__name__) for force in scene.forces]
-    lines += [f"force {getattr(function, '__name__', kind)}" for function, kind in named]
+    named = [
+        (getattr(force, "name", None), getattr(force, "function", None), type(force).__name__) for force in scene.forces
+    ]
+    lines += [
+        f"force {name!r} ({kind})" if name else f"force {getattr(function, '__name__', kind)}"
+        for name, function, kind in named
+    ]
     return "\n".join(lines)
 
 

@@ -317,6 +317,10 @@ def test_models_scenes_and_solutions_print_as_short_text():
     text = str(ARM)
     assert text.splitlines()[0] == "Model 'chain 2': 2 bodies, nq = 2, nv = 2, float64"
     assert all(name in text for name in (*ARM.body_names, *ARM.joint_names, "revolute", "0 1 0"))
+    foot = jd.contact.ground_contact(BODY, friction=0.5, name="foot")
+    assert str(jd.Scene(ARM, forces=[foot, jd.forces.JointDamping(1.0)])).endswith(
+        "force 'foot' (UnilateralContact)\nforce JointDamping"
+    )
     assert "(Gear): 1 holonomic row" in str(CHAIN) and str(jd.Scene(PLANE)) == "Scene of MetricSystem: nq = 2, nv = 2"
     solution = jd.simulate(PENDULUM, [0.1], [0.0], [0.0, 0.1], stepsize=0.05, outputs=("energy",))
     assert str(solution) == (
