@@ -216,7 +216,7 @@ def main(argv=None) -> dict[str, float]:
     solution, seconds = rollouts(model, options.rollouts, options.duration, progress=True)
     worst = float(np.abs(_balance(solution)).max())
     reach = float(np.abs(np.asarray(solution.energy) - np.asarray(solution.energy)[:, :1]).max())
-    print(f"   {seconds:.1f} s, compiling included; energy moved by up to {reach:.1f} J")
+    print(f"   {seconds:.1f} s, compiling included; the energy changes by up to {reach:.1f} J")
     print(f"   energy minus work: at most {worst:.1e} J")
     rollout_figure(model, solution).savefig(options.out / "rollouts.png")
     print(f"   drawn: {options.out / 'rollouts.png'}", flush=True)
