@@ -73,6 +73,7 @@ def readme(names):
 def first_steps(names):
     assert np.abs(names["turning"].constraint_residual).max() < 1e-14 and np.ptp(names["turning"].q[:, 2]) > 0.05
     assert np.abs(names["a"]).max() < 1e-10, "gravity compensation holds the arm still"
+    np.testing.assert_allclose(names["tip"][:3, 3], [0, 0, 1.261], atol=1e-12)
     assert names["accelerations"].shape == (1000, 7) and np.isfinite(names["gradient"]).all()
     assert 0 < names["drift"] < 1e-6
 
