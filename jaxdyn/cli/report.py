@@ -29,7 +29,9 @@ output (--out DIR):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="names of scenes (see --list)")
+    parser.add_argument(
+        "scenes", nargs="*", metavar="SCENE", help="names of scenes of jd.scenes (see --list), no files"
+    )
     option(parser, "--list", "print the scenes and exit")
     option(parser, "--out DIR", "directory for the page, the data and the text")
     option(parser, "--dtype T ...", "float64, float32 (default: float64)", default=["float64"])

@@ -61,8 +61,9 @@ torques (--torque):
   gravity          compensates gravity, N(q)
   random           smooth random torques (three harmonics of 0.5 Hz), another one for each motion
   gravity+random   both
-  FILE.csv, .npz   replays the columns tau1, tau2, ... (N m, N) of a log with t (s) and q1, q2, ...; it starts at
-                   the log's first state unless --q0 and --v0 say otherwise, and lasts as long as the log
+  FILE.csv, .npz   replays the columns tau_JOINT, or tau1, tau2, ... (N m, N), of a log with t (s) and q_JOINT, or q1,
+                   q2, ..., as --out writes them; it starts at the log's first state unless --q0 and --v0 say otherwise,
+                   and lasts as long as the log
 
 output (--out):
   .csv             columns t, q_.., v_.., tau_.. with the joints' names (numbers where a joint has several coordinates),

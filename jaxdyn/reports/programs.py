@@ -54,7 +54,10 @@ def case_of_scene(name: str) -> Case:
     **Raises:** ValueError for other names, and for scenes with forces that have modes, whose steps end at events.
     """
     if name not in scenes.names():
-        raise ValueError(f"scenes has {name!r}; give a jaxdyn.reports.Case, or choose from {', '.join(scenes.names())}")
+        raise ValueError(
+            f"scenes has {name!r}, which is no scene of jd.scenes: choose from {', '.join(scenes.names())}; for a scene of your "
+            "own, as of a file, pass a jaxdyn.reports.Case to jd.report"
+        )
     if has_modes(getattr(scenes, name)()):
         raise ValueError(f"scenes has {name!r}, whose steps end at events; a report compares steps of given lengths")
     scene = getattr(scenes, name)
