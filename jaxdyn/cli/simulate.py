@@ -39,6 +39,7 @@ from jaxdyn.simulation.events import events_of
 from jaxdyn.simulation.methods import Projected
 from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import Solution, simulate
+from jaxdyn.simulation.solvers.choice import Rodas5P, stiff_rates
 from jaxdyn.systems.scene import Scene
 
 HELP = "simulate a robot of a URDF, MJCF or SDF file, one motion or a batch, and write, plot or show the motions"
@@ -114,7 +115,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     solver = parser.add_argument_group("integration")
     option(solver, "--dt S", "fixed steps (Runge-Kutta of order 4) of this length, s", real)
-    option(solver, "--rtol RTOL", "tolerance of adaptive steps (order 8), the default: 1e-8", real, 1e-8)
+    option(
+        solver,
+        "--rtol RTOL",
+        "tolerance of adaptive steps (order 8, of Rodas5P if the start is stiff), the default: 1e-8",
+        real,
+        1e-8,
+    )
     option(solver, "--max-steps N", "stop after this number of steps", whole)
     option(
         solver,
@@ -163,6 +170,10 @@ def run(args: argparse.Namespace) -> int:
     steps: dict[str, Any] = {"stepsize": Steps(args.dt, rtol=rtol, atol=rtol, max_steps=args.max_steps)}
     if args.rank_tol is not None:
         steps["method"] = Projected(rank_tol=args.rank_tol)
+    # The program of a batch has traced states, by which `simulate` cannot choose its solver.
+    if args.dt is None and scene.forces and stiff_rates(scene, starts[0], speeds[0], 0.0, None, duration) is not None:
+        steps["solver"] = Rodas5P()
+        print("the forces are stiff at the start: steps of Rodas5P")
 
     watch = Stopwatch()
     carry = model if args.torque.startswith("gravity") else None

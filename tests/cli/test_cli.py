@@ -150,6 +150,16 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, folder, run):
 
 
 @pytest.mark.long
+def test_simulate_takes_implicit_steps_where_the_file_is_stiff(folder, run):
+    """Friction of a file on a link of 1e-4 kg m² decays at 3e5 1/s: explicit steps would be some 30 000."""
+    builder = jd.ModelBuilder("wrist")
+    builder.add_body("hand", None, "revolute", (0.1, (0.0, 0.0, 0.1), (1e-4, 1e-4, 1e-4)), axis=(1, 0, 0))
+    jd.save_urdf(builder.build().replace(friction=jnp.array([0.3])), "wrist.urdf")
+    text = run("simulate wrist.urdf --duration 0.5 --q0 0.1 --out motion.csv")
+    assert "steps of Rodas5P" in text and int(re.search(r"steps: (\d+)", text)[1]) < 1000
+
+
+@pytest.mark.long
 def test_simulate_a_batch_with_seed_and_plot(arm, folder, run):
     command = f"simulate {arm} --duration 0.1 --dt 0.01 --batch 3 --torque gravity+random"
     run(f"{command} --seed 1 --out a.npz --plot motion.png")
