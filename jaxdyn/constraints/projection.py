@@ -199,8 +199,8 @@ def enlarge(error, by):
 def _descend(x, size, step, residual):
     """Add step(residual(x)) to the correction x, `_STEPS_A_ROUND` times at most, until that changes a state by rounding alone.
 
-    `size` is the largest entry of the state. Also the largest entry of the next step, an estimate of the distance left, zero where
-    it is rounding, and whether to make it.
+    `size` is the largest entry of the state. Also the largest entry of the next step, an estimate of the distance left (zero
+    where it is rounding), and whether to make it.
     """
     rounding = float(jnp.finfo(x.dtype).eps) * size
 
