@@ -150,7 +150,8 @@ def _invalid_tangents(primals, tangents):
     moving = [x for x in of_leaves if not isinstance(x, zero)]
     # One, with derivatives: those of higher order are NaN too, where those of a constant NaN would be zero.
     shifts = [x - jax.lax.stop_gradient(x) for x, dx in zip(leaves, of_leaves, strict=True) if not isinstance(dx, zero)]
-    one = jnp.exp(sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in shifts))
+    # Inputs of several dtypes, as of a scene in float32 whose coefficients are not, have no sum without a cast.
+    one = jnp.exp(sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)).astype(float) for x in shifts))
 
     def add(value, tangent):
         tangent = jnp.zeros_like(value) if isinstance(tangent, zero) else tangent

@@ -199,8 +199,8 @@ def enlarge(error, by):
 def _descend(x, size, step, residual):
     """Add step(residual(x)) to the correction x, `_STEPS_A_ROUND` times at most, until that changes a state by rounding alone.
 
-    `size` is the largest entry of the state. Also the largest entry of the next step, an estimate of the distance left, and
-    whether to make it.
+    `size` is the largest entry of the state. Also the largest entry of the next step, an estimate of the distance left (zero
+    where it is rounding), and whether to make it.
     """
     rounding = float(jnp.finfo(x.dtype).eps) * size
 
@@ -223,7 +223,9 @@ def _descend(x, size, step, residual):
     for _ in range(_STEPS_A_ROUND):
         state = jax.tree.map(partial(jnp.where, state[2]), improve(state), state)
     x, _, more, away = state
-    return x, away, more & (away > ROUNDING_FACTOR * rounding)
+    # Rounding that counted as an error would not fall with the step: in float32 it is larger than the tolerances.
+    is_away = away > ROUNDING_FACTOR * rounding
+    return x, jnp.where(is_away, away, jnp.zeros_like(away)), more & is_away
 
 
 def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):

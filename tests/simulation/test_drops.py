@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -159,3 +160,29 @@ def test_a_block_on_many_points_slides_to_rest(count, caplog):
     assert motion.success and not caplog.records
     np.testing.assert_allclose(motion.v[:, 0], np.maximum(1 - 0.5 * G * ts, 0), rtol=0, atol=1e-10)
     np.testing.assert_allclose(motion.q[-1], start + np.eye(7)[0] / G, rtol=0, atol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start, dtype, tol", [((0.0, 1.0), "float32", 1e-5), ((1000.0, -3e-8), "float64", 1e-10)])
+def test_derivatives_of_friction_while_a_body_bounces_to_rest_or_starts_in_the_ground(start, dtype, tol):
+    """A body that slides all the time moves v T - mu (g T^2/2 - h), as its normal impulse is that of gravity, whatever bounces.
+
+    Both are below the ground by rounding where they come to rest on it, the second as it is far from the origin. In float32
+    derivatives have the tolerance of the run, ten rounding errors.
+    """
+    builder = jd.ModelBuilder("body", gravity=(0, 0, -G))
+    builder.add_body("sledge", None, "prismatic", (0.0, (0, 0, 0), (0, 0, 0)), axis=(1, 0, 0))
+    builder.add_body("body", "sledge", "prismatic", (2.0, (0, 0, 0), (0, 0, 0)), axis=(0, 0, 1))
+    model = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, builder.build())
+
+    def place(p):
+        touch = jd.contact.ground_contact("body", friction=p[0], restitution=0.5)
+        speed = jnp.stack([p[1], 0 * p[1]])
+        ts = jnp.linspace(0, 2.0, 2, dtype=dtype)
+        options: Any = TIGHT if dtype == "float64" else {}
+        return jd.simulate(jd.Scene(model, forces=[touch]), jnp.asarray(start, dtype), speed, ts, **options).q[-1]
+
+    derivative = jax.jit(jax.jacrev(place))(jnp.asarray([0.2, 12.0], dtype))
+    assert derivative.dtype == dtype
+    want = [-(2 * G - max(start[1], 0.0)), 2.0]
+    np.testing.assert_allclose(derivative, [want, [0.0, 0.0]], rtol=tol, atol=tol)

@@ -326,7 +326,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
 
     # The start may be an impact, whose velocity follows the start.
     y = system.impact(unknown, begun.impact, ts[0], ravel_pytree(y0)[0])
-    y = system.with_slip(y, None, lax.stop_gradient(begun.slip))
+    y = _begin_on_rows(system, unknown, begun.mode, ts[0], system.with_slip(y, None, lax.stop_gradient(begun.slip)))
     # With a checkpoint, reverse mode keeps one state a part, and the steps of one part at a time.
     _, (times, rows) = lax.scan(jax.checkpoint(part_or_none), (ts[0], y, begun.mode), order)
     # The inverse permutation: save points first, then events.
@@ -354,7 +354,17 @@ def _cross(system: HybridSystem, unknown, mode: Mode, record: Records, t, known_
     # To the event by the motion before it: a shift of value zero, with the first and second derivatives of the time.
     y = _shift(system.plan, (unknown, mode), known_time, y, late)
     slip = system.slip_behind(unknown, mode, record.mode, lax.stop_gradient(record.slip), time, y)
-    return time, system.with_slip(system.impact(unknown, record.impact, time, y), None, slip)
+    y = system.with_slip(system.impact(unknown, record.impact, time, y), None, slip)
+    return time, _begin_on_rows(system, unknown, record.mode, time, y)
+
+
+def _begin_on_rows(system: HybridSystem, unknown, mode: Mode, t, y):
+    """State from which the run has begun a mode: y moved onto the rows that act, by a constant."""
+    if not system.elements.each:
+        return y
+    # What is moved is rounding. Left to the first step it would count as its error, and no step would be short enough.
+    args = lax.stop_gradient(((unknown, mode), t, y))
+    return y + lax.stop_gradient(_begin_mode(system, *args)[0] - args[2])
 
 
 def _shift(plan, args, t, y, late):
