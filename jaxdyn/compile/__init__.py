@@ -37,5 +37,6 @@ from jaxdyn.compile.rules import batch_alike as batch_alike
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivatives
 from jaxdyn.compile.rules import mark_invalid as mark_invalid
+from jaxdyn.compile.rules import forward_only as forward_only
 from jaxdyn.compile.rules import reverse_only as reverse_only
 from jaxdyn.compile.rules import value_and_jvp as value_and_jvp
