@@ -29,8 +29,8 @@ _FIRST_ORDER = (
     'jd.simulate, Hessians need adjoint="direct", or adjoint="forward" and jax.jacfwd twice'
 )
 _FORWARD_ONLY = (
-    "reverse mode (jax.grad, jax.jacrev) through this run needs adjoint='reverse' of jd.simulate (the default) or 'direct': "
-    "adjoint='forward' of this method has derivatives in forward mode alone (jax.jvp, jax.jacfwd)"
+    'adjoint="forward" of this method has derivatives in forward mode alone (jax.jvp, jax.jacfwd); reverse mode (jax.grad, '
+    'jax.jacrev) needs adjoint="reverse", the default of jd.simulate, and Hessians adjoint="direct" or jax.jacfwd twice'
 )
 
 
