@@ -239,7 +239,9 @@ def forward_only(tree, message: str):
     """
     if _result_p is None:
         return tree
-    return jax.tree.map(lambda x: _result_p.bind(x, message=message) if hasattr(x, "dtype") and is_float(x) else x, tree)
+    return jax.tree.map(
+        lambda x: _result_p.bind(x, message=message) if hasattr(x, "dtype") and is_float(x) else x, tree
+    )
 
 
 def _result_jvp(primals, tangents, *, message: str):

@@ -59,7 +59,8 @@ def test_methods_with_first_derivatives_alone_name_what_gives_second_ones():
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "options", [{"solver": diffrax.Kvaerno3()}, {"method": "variational", "stepsize": jd.simulation.Steps(0.05, max_steps=4)}]
+    "options",
+    [{"solver": diffrax.Kvaerno3()}, {"method": "variational", "stepsize": jd.simulation.Steps(0.05, max_steps=4)}],
 )
 def test_reverse_mode_names_its_option(options):
     """Through loops of diffrax; what does not depend on the run is differentiated, and forward mode is as without the mark."""
@@ -67,7 +68,11 @@ def test_reverse_mode_names_its_option(options):
     def end(q, adjoint="forward"):
         return simulated(q, adjoint=adjoint, **options).sum()
 
-    for derivative, q in ((jax.grad(end), Q), (jax.jit(jax.vmap(jax.grad(end))), jnp.stack([Q, -Q])), (jax.hessian(end), Q)):
+    for derivative, q in (
+        (jax.grad(end), Q),
+        (jax.jit(jax.vmap(jax.grad(end))), jnp.stack([Q, -Q])),
+        (jax.hessian(end), Q),
+    ):
         with pytest.raises(ValueError, match='needs adjoint="reverse"'):
             derivative(q)
     apart = jax.grad(lambda q: end(jax.lax.stop_gradient(q)) + q.sum())(Q)

@@ -88,7 +88,9 @@ def run(inputs, given: DiffraxRun):
         progress_meter=given.progress,
     )
     if isinstance(given.adjoint, diffrax.ForwardMode):
-        solved = eqx.tree_at(lambda solved: (solved.ys, solved.ts), solved, forward_only((solved.ys, solved.ts), _FORWARD_ONLY))
+        solved = eqx.tree_at(
+            lambda solved: (solved.ys, solved.ts), solved, forward_only((solved.ys, solved.ts), _FORWARD_ONLY)
+        )
     counts = {name: solved.stats[name] for name in COUNTS}
     if continuous:
         reached = jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
