@@ -288,8 +288,8 @@ class OwnProgram(NamedTuple):
         return equations_of_motion(*self, eqx.filter(args[-1], eqx.is_array), args[:-1])
 
 
-# The message that a control or a force has no kernel shows this name.
 @kernel(static=2, derivative="program")
 def equations_of_motion(function, by_rules, args, given):
+    """Value of an `OwnProgram`. The message that a control or a force has no kernel shows this name."""
     with values_of_rules(by_rules):
         return function(*given, args)
