@@ -34,6 +34,7 @@ from jaxdyn.compile.pivots import eliminate_rows as eliminate_rows
 from jaxdyn.compile.pivots import solver_of as solver_of
 from jaxdyn.compile.pivots import triangular_solution as triangular_solution
 from jaxdyn.compile.rules import batch_alike as batch_alike
+from jaxdyn.compile.rules import forward_only as forward_only
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivatives
 from jaxdyn.compile.rules import mark_invalid as mark_invalid

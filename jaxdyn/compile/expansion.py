@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import array_rules, jax_adapter, mode, rearrange, rolled
@@ -425,4 +426,6 @@ _OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO, "log2", "one_minus_
 def _constant(x) -> np.ndarray:
     if isinstance(x, Tracer):
         raise NotNumbers("a number of an enclosing function")
+    if jnp.issubdtype(getattr(x, "dtype", float), jax.dtypes.extended):  # a key, which numpy does not have
+        raise NotNumbers(f"an array of {x.dtype}")
     return np.asarray(x)

@@ -26,7 +26,6 @@ from jaxdyn.compile.program import (
     TooLong,
     as_kind,
     dtype_of,
-    kind_of,
     kind_or_refuse,
     objects,
     with_type,
@@ -80,7 +79,7 @@ class Graph:
         return objects(entries, array.shape)
 
     def call(self, program: Program, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The outputs of a subprogram."""
+        """The outputs of a subprogram. **Raises:** `NotNumbers` for a dtype that programs do not have."""
         return self._parts("call", program, [entry for x in inputs for entry in x.ravel().tolist()])
 
     def call_where(
@@ -101,7 +100,7 @@ class Graph:
         call = self.make(op, "call", number, *entries)
         outputs, at = [], 0
         for row, array in zip(program.results, program.outputs, strict=True):
-            kind = kind_of(array.dtype)
+            kind = kind_or_refuse(array.dtype)
             # A result that is known has no part, unless the call may not happen.
             parts = [
                 x.value if type(x) is Constant and op == "call" else self.make("part", kind, call, at + k)

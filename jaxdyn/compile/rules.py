@@ -181,7 +181,7 @@ _nan_where_p = _define_flagged(
 )
 
 
-# --- values whose derivatives exist in reverse mode alone ---
+# --- values whose derivatives exist in one mode alone ---
 
 
 def reverse_only(tree, message: str, *, first_order: bool = False):
@@ -229,6 +229,40 @@ _tangent_p = define_primitive(
     batch=lambda arrays, axes, message: _refuse(message=message),
     jvp=_tangent_jvp,
     transpose=lambda cotangent, x, message: [cotangent],
+)
+
+
+def forward_only(tree, message: str):
+    """The same values; reverse mode through them raises ValueError with a message.
+
+    JAX refuses reverse mode through a `lax.while_loop` without saying what to do instead. The values that a loop returns are
+    marked, since reverse mode meets its results first.
+    """
+    if _result_p is None:
+        return tree
+    return jax.tree.map(
+        lambda x: _result_p.bind(x, message=message) if hasattr(x, "dtype") and is_float(x) else x, tree
+    )
+
+
+def _result_jvp(primals, tangents, *, message: str):
+    (x,), (tangent,) = primals, tangents
+    bind = _result_p.bind
+    return bind(x, message=message), tangent if is_zero(tangent) else bind(tangent, message=message)
+
+
+def _result_transpose(cotangent, x, *, message: str):
+    return [cotangent] if is_zero(cotangent) else _refuse(message=message)
+
+
+_result_p = define_primitive(
+    "jaxdyn_forward_only",
+    lambda x, **_: x,
+    implement=lambda x, **_: x,
+    lower=lambda x, **_: x,
+    batch=lambda arrays, axes, **of: (_result_p.bind(*arrays, **of), axes[0]),
+    jvp=_result_jvp,
+    transpose=_result_transpose,
 )
 
 

@@ -345,12 +345,15 @@ def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool
         D = S.T @ articulated[i] @ S + np.diag(rotor)
         v, w = np.linalg.norm(S[:3], axis=0), np.linalg.norm(S[3:], axis=0)
         mass, first, second = (np.linalg.norm(composite[i][a, b]) for a, b in ((_V, _V), (_W, _V), (_W, _W)))
-        carried = articulated[i]
-        # Where the exact value is zero, rounding leaves about 1e-16 of the products that S^T I S is summed from.
-        if np.any(np.abs(whole) <= 1e-13 * (v * v * mass + 2 * v * w * first + w * w * second)):
+        # Roots first: products of tiny inertias would vanish.
+        root, carried = np.sqrt(np.abs(whole)), articulated[i]
+        # Where the exact value is zero, rounding leaves about 1e-16 of the products that S^T I S is summed from. XLA takes
+        # numbers below the normal ones for zero.
+        zero = np.finfo(float).tiny + 1e-13 * (v * v * mass + 2 * v * w * first + w * w * second)
+        if np.any(np.abs(whole) <= zero):
             idle[i] = True
         # D of exactly dependent joints is rounding of the numbers it is the difference of; 1e-12 of them is a margin.
-        elif np.abs(np.linalg.eigvalsh(D / np.sqrt(np.abs(np.outer(whole, whole))))).min() <= 1e-12:
+        elif np.abs(np.linalg.eigvalsh(D / np.outer(root, root))).min() <= 1e-12:
             idle[i] = False
         else:
             U = articulated[i] @ S

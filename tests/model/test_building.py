@@ -292,6 +292,13 @@ def test_what_is_singular_at_one_configuration_alone_is_accepted():
     # A micrometre cube of water in free flight, and a needle with a slight but real moment about its axis.
     assert built(joint="free", inertia=(1e-15, (0, 0, 0), (1.7e-28,) * 3)).nb == 1
     assert built(joint="spherical", inertia=(1.0, (0, 0, 0.5), (0.1, 0.1, 1e-9))).nb == 1
+    # Products of such inertias underflow, a warning of NumPy's that is an error here. Below the normal numbers they are zero.
+    rod = (1e-300, (0, 0, -0.5), (1e-301,) * 3)
+    light = built(inertia=rod, axis=(0, 1, 0))
+    acceleration = jd.forward_dynamics(light, jnp.ones(1), jnp.zeros(1), jnp.zeros(1))
+    np.testing.assert_allclose(acceleration, -9.81 * 0.5 * np.sin(1.0) / 0.35, rtol=1e-10)
+    with pytest.raises(ValueError, match="moves no inertia"):
+        built(inertia=(1e-310, (0, 0, -0.5), (1e-311,) * 3))
 
 
 def test_inertia_report_and_repair():

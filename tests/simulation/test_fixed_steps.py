@@ -9,6 +9,7 @@ from mechanisms import slider
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
+from jaxdyn.compile import mode
 
 SOLVERS = {"RK4": None, "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8(), "Rodas5P": jd.solvers.Rodas5P()}
 
@@ -140,3 +141,37 @@ def test_torques_are_held_in_a_run_that_steps_do_not_fill():
     control = jd.identify.SampledTorque([0.0, 0.1, 0.2, 0.3], [[1.0], [2.0], [3.0], [4.0]], "previous")
     motion = jd.simulate(slider(), [0.0], [0.0], [0.0, 0.25], control=control, stepsize=0.1)
     np.testing.assert_allclose(motion.v[-1], 0.1 + 0.2 + 0.05 * 3, rtol=1e-14)
+
+
+@jax.jit
+def is_swapped(q):
+    return (q[0] > q[1]).astype(jnp.uint32)
+
+
+KEY = jax.random.key(0)
+SORTED = {
+    "key": lambda q, v, t: -jnp.where(jax.random.uniform(KEY) < 2, jnp.sort(q), q),
+    "sort": lambda q, v, t: -jnp.sort(q),
+    "places": lambda q, v, t: -q[jnp.argsort(q)],
+    "uint32": lambda q, v, t: -jnp.where(is_swapped(q) == 1, q[::-1], q),
+}
+
+
+@pytest.mark.parametrize("law", SORTED)
+def test_gradients_through_controls_without_a_kernel(law, caplog, monkeypatch):
+    """Two masses under forces -(q1, q0) while q0 > q1: RK4 multiplies the state by 1 + hA + ... + (hA)^4 / 24."""
+    monkeypatch.setattr(mode, "_said", set())
+    builder = jd.ModelBuilder("two masses", gravity=None)
+    for name in "ab":
+        builder.add_body(name, joint="prismatic", axis=(1, 0, 0), inertia=(1.0, (0, 0, 0), (1, 1, 1)))
+    model, ts, q = builder.build(), jnp.array([0.0, 0.1]), jnp.array([0.4, -0.2])
+
+    def end(q, law=SORTED[law]):
+        return jd.simulate(model, q, jnp.zeros(2), ts, control=law, stepsize=0.025).q[-1]
+
+    zero, swap = np.zeros((2, 2)), np.eye(2)[::-1]
+    z = 0.025 * np.block([[zero, np.eye(2)], [-swap, zero]])
+    step = np.eye(4) + z @ (np.eye(4) + z @ (np.eye(4) + z @ (np.eye(4) + z / 4) / 3) / 2)
+    np.testing.assert_allclose(jax.jacrev(end)(q), np.linalg.matrix_power(step, 4)[:2, :2], rtol=0, atol=1e-12)
+    if law == "sort":
+        assert "equations_of_motion runs on JAX's own operations: sort" in caplog.text

@@ -1,4 +1,4 @@
-"""Forward mode of runs and steps whose derivatives exist in reverse mode: refused with the option that allows it."""
+"""Derivatives of runs and steps in a mode that their adjoint does not have: refused with the option that allows it."""
 
 import diffrax
 import jax
@@ -55,3 +55,28 @@ def test_methods_with_first_derivatives_alone_name_what_gives_second_ones():
     gradient = jax.jit(jax.grad(end))
     differences = [(gradient(Q + step) - gradient(Q - step)) / 2e-5 for step in 1e-5 * np.eye(2)]
     np.testing.assert_allclose(hessian, differences, rtol=0, atol=1e-8)  # of the differences
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "options",
+    [{"solver": diffrax.Kvaerno3()}, {"method": "variational", "stepsize": jd.simulation.Steps(0.05, max_steps=4)}],
+)
+def test_reverse_mode_names_its_option(options):
+    """Through loops of diffrax; what does not depend on the run is differentiated, and forward mode is as without the mark."""
+
+    def end(q, adjoint="forward"):
+        return simulated(q, adjoint=adjoint, **options).sum()
+
+    for derivative, q in (
+        (jax.grad(end), Q),
+        (jax.jit(jax.vmap(jax.grad(end))), jnp.stack([Q, -Q])),
+        (jax.hessian(end), Q),
+    ):
+        with pytest.raises(ValueError, match='needs adjoint="reverse"'):
+            derivative(q)
+    apart = jax.grad(lambda q: end(jax.lax.stop_gradient(q)) + q.sum())(Q)
+    np.testing.assert_array_equal(apart, 1.0)
+    by_rows = jax.jit(jax.grad(lambda q: end(q, "reverse")))(Q)
+    # Adaptive steps of two programs differ by the rounding of error estimates.
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(end))(Q), by_rows, rtol=1e-7)

@@ -16,7 +16,7 @@ import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import PyTree
 
-from jaxdyn.compile import reverse_only
+from jaxdyn.compile import forward_only, reverse_only
 from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.equations import WITHIN
 from jaxdyn.simulation.solvers.base import Flag, StepOutput, Wrapped
@@ -27,6 +27,10 @@ from jaxdyn.simulation.solvers.guards import delay
 _FIRST_ORDER = (
     'this method has first derivatives in reverse mode alone; forward mode (jax.jvp, jax.jacfwd) needs adjoint="forward" of '
     'jd.simulate, Hessians need adjoint="direct", or adjoint="forward" and jax.jacfwd twice'
+)
+_FORWARD_ONLY = (
+    'adjoint="forward" of this method has derivatives in forward mode alone (jax.jvp, jax.jacfwd); reverse mode (jax.grad, '
+    'jax.jacrev) needs adjoint="reverse", the default of jd.simulate, and Hessians adjoint="direct" or jax.jacfwd twice'
 )
 
 
@@ -83,6 +87,10 @@ def run(inputs, given: DiffraxRun):
         throw=False,
         progress_meter=given.progress,
     )
+    if isinstance(given.adjoint, diffrax.ForwardMode):
+        solved = eqx.tree_at(
+            lambda solved: (solved.ys, solved.ts), solved, forward_only((solved.ys, solved.ts), _FORWARD_ONLY)
+        )
     counts = {name: solved.stats[name] for name in COUNTS}
     if continuous:
         reached = jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))

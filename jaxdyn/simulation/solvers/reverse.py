@@ -285,10 +285,11 @@ class OwnProgram(NamedTuple):
 
     def __call__(self, *args):
         """Value of the function, of whose last argument the arrays are passed."""
-        return _apply(*self, eqx.filter(args[-1], eqx.is_array), args[:-1])
+        return equations_of_motion(*self, eqx.filter(args[-1], eqx.is_array), args[:-1])
 
 
 @kernel(static=2, derivative="program")
-def _apply(function, by_rules, args, given):
+def equations_of_motion(function, by_rules, args, given):
+    """Value of an `OwnProgram`. The message that a control or a force has no kernel shows this name."""
     with values_of_rules(by_rules):
         return function(*given, args)
