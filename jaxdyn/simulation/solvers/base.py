@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, PyTree
 
 from jaxdyn.compile.known import stop_gradient
-from jaxdyn.constraints.projection import enlarge
+from jaxdyn.constraints.projection import ROUNDING_FACTOR, enlarge
 from jaxdyn.model.arguments import Number
 
 Flag: TypeAlias = bool | Bool[Array, ""]
@@ -159,8 +159,9 @@ class ProjectedSolver(Wrapped):
         shift = jax.tree.map(lambda a, b: a - b, projected, y)
         if error is not None:
             tangent = jax.tree.map(
-                lambda left, error, shift: enlarge(left, _excess_shift(shift, error - left)), tangent, error, shift
-            )
+                lambda y, left, error, shift: enlarge(left, _excess_shift(y, shift, error - left)),
+                y, tangent, error, shift,
+            )  # fmt: skip
         return following, shift, tangent
 
     def step(
@@ -175,10 +176,11 @@ class ProjectedSolver(Wrapped):
         return projected, error, {"dense_info": dense_info, "shift": shift}, solver_state, result
 
 
-def _excess_shift(shift, removed):
-    """Shift of a projection where it exceeds what was removed of the error, else zero."""
+def _excess_shift(y, shift, removed):
+    """Shift of y by a projection where it exceeds what was removed of the error, and rounding; else zero."""
+    y, size, removed = (jnp.max(jnp.abs(x), initial=0.0) for x in (y, shift, removed))
     # Written with "not below", so that a shift of NaN counts as excess.
-    beyond = ~(jnp.max(jnp.abs(shift), initial=0.0) <= _EXPECTED * jnp.max(jnp.abs(removed), initial=0.0))
+    beyond = ~(size <= jnp.maximum(_EXPECTED * removed, ROUNDING_FACTOR * float(jnp.finfo(shift.dtype).eps) * y))
     return jnp.where(beyond, shift, jnp.zeros_like(shift))
 
 

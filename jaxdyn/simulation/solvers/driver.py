@@ -177,8 +177,8 @@ def _accept(plan: Plan, control, args, limits: Limits, state: State, active, ste
     t = jnp.where(kept, jnp.minimum(t_next, limits.end), state.t)
     after = t + decided.length
     if is_adaptive:
-        # A step that would end within rounding of the end goes there; a refused one tries half of the way.
-        clipped = jnp.where(kept, limits.end, t + 0.5 * (limits.end - t))
+        # A step that would end within rounding of the end goes there; a refused one tries half of the way, or less.
+        clipped = jnp.where(kept, limits.end, jnp.minimum(after, t + 0.5 * (limits.end - t)))
         point = jnp.where(after > limits.floor, clipped, after)
     else:
         start, before, y, error = (plan.structure(x) for x in (limits.y0, state.y, step.projected, step.error))
