@@ -249,6 +249,7 @@ CONCRETE = {"simulate", "stepper", "follow", "identify.complete_log", "reduction
 TRACED = {"constraints.body_wrenches", "constraints.constraint_wrenches"}
 # Public functions that decide nothing on rows, and why.
 OTHERS = {
+    "of all rows, whatever their rank": ("constraints.position_residual", "constraints.velocity_residual"),
     "pictures of states": ("animate", "draw", "view", "pictures."),
     "contact cones act on given multipliers": ("contact.contact_forces",),
     "laws without constraints": ("control.ComputedTorque", "control.OperationalSpace"),

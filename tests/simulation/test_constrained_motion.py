@@ -348,12 +348,13 @@ def test_a_parallelogram_passes_its_flat_position(in_plane):
 
 @pytest.mark.long
 @pytest.mark.parametrize("in_plane", [True, pytest.param(False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("tolerance", "least", "error", "gain"), [(1e-8, 0.99, 2e-7, 1e-4), (1e-10, 0.75, 1e-7, 1e-6)])
+@pytest.mark.parametrize(("tolerance", "least", "error", "gain"), [(1e-8, 0.99, 2e-7, 1e-4), (1e-10, 0.75, 1e-7, 2e-6)])
 def test_antiparallelograms_pass_their_flat_position(tolerance, least, error, gain, in_plane):
     """tan(rocker/2) = -2 tan(crank/2), at 200 rates.
 
     At a distance d from it, rounding turns the velocity by eps/d^2. A run with steps that end where this exceeds the tolerance
-    says so; what passes at the looser one has lost up to 1e-6 of its energy.
+    says so; what passes at the looser one has lost up to 1e-6 of its energy. At the tighter one, of a thousand rates none or one
+    loses more than 1e-6 J, at most 1.3e-6, as steps happen to end.
     """
     scene, q, v = equal_cranks(-0.5, 2 * np.arctan(2 * np.tan(0.25)), 1.0, in_plane)
 
