@@ -207,10 +207,10 @@ def _mark_jvp(primals, tangents, *, message: str, first_order: bool):
     return _mark_p.bind(x, message=message, first_order=True) if first_order else x, moved
 
 
-def _tangent_jvp(primals, tangents, *, message: str):
+def _identity_jvp(bind: Callable, primals, tangents, **of):
+    """The JVP rule of a linear primitive whose result is its operand."""
     (x,), (tangent,) = primals, tangents
-    bind = _tangent_p.bind
-    return bind(x, message=message), tangent if is_zero(tangent) else bind(tangent, message=message)
+    return bind(x, **of), tangent if is_zero(tangent) else bind(tangent, **of)
 
 
 _mark_p = define_primitive(
@@ -227,7 +227,7 @@ _tangent_p = define_primitive(
     implement=_refuse,
     lower=_refuse,
     batch=lambda arrays, axes, message: _refuse(message=message),
-    jvp=_tangent_jvp,
+    jvp=lambda *given, **of: _identity_jvp(_tangent_p.bind, *given, **of),
     transpose=lambda cotangent, x, message: [cotangent],
 )
 
@@ -245,12 +245,6 @@ def forward_only(tree, message: str):
     )
 
 
-def _result_jvp(primals, tangents, *, message: str):
-    (x,), (tangent,) = primals, tangents
-    bind = _result_p.bind
-    return bind(x, message=message), tangent if is_zero(tangent) else bind(tangent, message=message)
-
-
 def _result_transpose(cotangent, x, *, message: str):
     return [cotangent] if is_zero(cotangent) else _refuse(message=message)
 
@@ -261,7 +255,7 @@ _result_p = define_primitive(
     implement=lambda x, **_: x,
     lower=lambda x, **_: x,
     batch=lambda arrays, axes, **of: (_result_p.bind(*arrays, **of), axes[0]),
-    jvp=_result_jvp,
+    jvp=lambda *given, **of: _identity_jvp(_result_p.bind, *given, **of),
     transpose=_result_transpose,
 )
 

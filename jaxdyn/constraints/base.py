@@ -258,6 +258,7 @@ def position_residual(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) ->
 
 @kernel
 def _position_residual(scene: Scene, q, t):
+    layout(scene)  # raises for entries that are no constraints, and for constraints that do not fit the system
     parts = [part for part in _positions(scene, q, t) if part is not None]
     return _drop(scene, jnp.concatenate(parts), holonomic_rows) if parts else jnp.zeros((0,), q.dtype)
 

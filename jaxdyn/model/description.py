@@ -43,15 +43,15 @@ def scene_lines(scene) -> str:
         f"constraint {getattr(one, 'name', '')!r} ({type(one).__name__}): {_rows(one, scene.system)}"
         for one in scene.constraints
     ]
+    return "\n".join([*lines, *(_force_line(force) for force in scene.forces)])
+
+
+def _force_line(force) -> str:
+    kind, name = type(force).__name__, getattr(force, "name", None)
     # A static wrapper shows the name of the function that it holds.
-    named = [
-        (getattr(force, "name", None), getattr(force, "function", None), type(force).__name__) for force in scene.forces
-    ]
-    lines += [
-        f"force {name!r} ({kind})" if name else f"force {getattr(function, '__name__', kind)}"
-        for name, function, kind in named
-    ]
-    return "\n".join(lines)
+    return (
+        f"force {name!r} ({kind})" if name else f"force {getattr(getattr(force, 'function', None), '__name__', kind)}"
+    )
 
 
 def _rows(constraint, system) -> str:

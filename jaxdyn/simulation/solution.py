@@ -230,8 +230,8 @@ def _advice(name: str, solution: Solution, scene: Scene, control, options) -> st
         row = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1]) if name == "max_steps_reached" else 0
         state = solution.q[row], solution.v[row], solution.ts[row]
         span = float(solution.ts[-1]) - float(solution.ts[0])
-        solver, is_default = options.solver, solution.solver in ("Dopri8", "RK4")
-        is_explicit = is_default if solver is None else isinstance(innermost(solver), diffrax.AbstractERK)
+        # Solvers by default are explicit.
+        is_explicit = options.solver is None or isinstance(innermost(options.solver), diffrax.AbstractERK)
         rates = stiff_rates(scene, *state, at_start(control, *state), span) if is_explicit else None
         if rates is not None:
             advice = (

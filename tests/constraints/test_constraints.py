@@ -258,8 +258,14 @@ def test_names_and_refusals(pair):
         "value has shape": (jd.constraints.lock_joint("e_joint", 0.0),),
     }
     for message, constraints in bad.items():
-        with pytest.raises(ValueError, match=message):
-            rows(jd.Scene(pair, constraints), q, v, 0.0)
+        scene = jd.Scene(pair, constraints)
+        for of_state in (
+            rows,
+            jd.constraints.velocity_residual,
+            lambda scene, q, v: jd.constraints.position_residual(scene, q),
+        ):
+            with pytest.raises(ValueError, match=message):
+                of_state(scene, q, v)
     made = {
         "joint 'hinge' is": lambda: jd.loop("a", None, "b", None, "hinge"),
         "both frames are": lambda: jd.loop("a", None, "a", None),

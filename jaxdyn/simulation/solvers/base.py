@@ -178,9 +178,10 @@ class ProjectedSolver(Wrapped):
 
 def _excess_shift(y, shift, removed):
     """Shift of y by a projection where it exceeds what was removed of the error, and rounding; else zero."""
-    y, size, removed = (jnp.max(jnp.abs(x), initial=0.0) for x in (y, shift, removed))
+    state, moved, expected = (jnp.max(jnp.abs(x), initial=0.0) for x in (y, shift, _EXPECTED * removed))
+    rounding = ROUNDING_FACTOR * float(jnp.finfo(shift.dtype).eps) * state
     # Written with "not below", so that a shift of NaN counts as excess.
-    beyond = ~(size <= jnp.maximum(_EXPECTED * removed, ROUNDING_FACTOR * float(jnp.finfo(shift.dtype).eps) * y))
+    beyond = ~(moved <= jnp.maximum(expected, rounding))
     return jnp.where(beyond, shift, jnp.zeros_like(shift))
 
 
