@@ -348,13 +348,13 @@ def test_a_parallelogram_passes_its_flat_position(in_plane):
 
 @pytest.mark.long
 @pytest.mark.parametrize("in_plane", [True, pytest.param(False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("tolerance", "least", "error", "gain"), [(1e-8, 0.99, 2e-7, 1e-4), (1e-10, 0.75, 1e-7, 2e-6)])
-def test_antiparallelograms_pass_their_flat_position(tolerance, least, error, gain, in_plane):
-    """tan(rocker/2) = -2 tan(crank/2), at 200 rates.
+@pytest.mark.parametrize(("tolerance", "min_share", "error", "loss"), [(1e-8, 0.97, 1e-7, 4e-5), (1e-10, 0.75, 1e-8, 4e-7)])
+def test_antiparallelograms_pass_their_flat_position(tolerance, min_share, error, loss, in_plane):
+    """sin(rocker/2) cos(crank/2) = -2 cos(rocker/2) sin(crank/2), at 200 rates.
 
     At a distance d from it, rounding turns the velocity by eps/d^2. A run with steps that end where this exceeds the tolerance
-    says so; what passes at the looser one has lost up to 1e-6 of its energy. At the tighter one, of a thousand rates none or one
-    loses more than 1e-6 J, at most 1.3e-6, as steps happen to end.
+    says so. How near steps end is chance, so the bounds are those of shares: of 4000 rates 0.6 to 0.9 % and 15 to 18 % stop; of
+    the energy of 30 J 99 % of the others lose up to 1.7e-5 and 1.5e-7 J, and one of them 2e-4 J.
     """
     scene, q, v = equal_cranks(-0.5, 2 * np.arctan(2 * np.tan(0.25)), 1.0, in_plane)
 
@@ -366,12 +366,14 @@ def test_antiparallelograms_pass_their_flat_position(tolerance, least, error, ga
 
     q, energy, codes = map(np.asarray, jax.jit(run)(jnp.linspace(3.2, 4.8, 200)))
     succeeded = codes == jd.RESULTS.successful.index
-    assert succeeded.mean() >= least
+    assert succeeded.mean() >= min_share
     assert (succeeded | (codes == jd.RESULTS.dt_min_reached.index)).all()
-    first, _, last = np.moveaxis(q[succeeded], -1, 0)
-    assert (first[:, 0] < -0.1).all() and (first[:, -1] > 0.1).all()
-    np.testing.assert_allclose(np.tan(last / 2), -2 * np.tan(first / 2), atol=error)
-    np.testing.assert_array_less(np.ptp(energy[succeeded], axis=1), gain)  # of 30 J
+    crank, _, rocker = np.moveaxis(q[succeeded], -1, 0) / 2
+    assert (crank[:, 0] < -0.05).all() and (crank[:, -1] > 0.05).all()
+    np.testing.assert_allclose(np.sin(rocker) * np.cos(crank), -2 * np.cos(rocker) * np.sin(crank), atol=error)
+    losses = np.ptp(energy[succeeded], axis=1)
+    assert np.quantile(losses, 0.97) < loss
+    assert losses.max() < 1e-3
 
 
 @pytest.mark.long
