@@ -3,7 +3,7 @@
 import argparse
 import json
 import pathlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -132,90 +132,30 @@ def run(args: argparse.Namespace) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is {value}; give a positive number")
     # A file that needs repair cannot be loaded before it; the repair is for trees.
     mechanism = None if args.repair else load_mechanism(args.urdf, args)
-    if mechanism is not None:
+    if mechanism is None:
+        run_tree(args)
+    else:
         run_mechanism(mechanism, args)
-        return
-    # Paths are checked before the fit, which takes minutes.
+
+
+def run_tree(args: argparse.Namespace) -> None:
+    """Fit, print errors and parameters, write the files, of a robot without loops."""
+    # Paths and options are checked before logs are read, and before the fit, which takes minutes.
     out = output_path(args.out, (".urdf",), "--out")
     json_path = output_path(args.report, (".json",), "--report")
     html = output_path(args.html, (".html",), "--html")
     options = parse_options(args)
-    if out is not None and args.method == "least-squares":
-        raise ValueError("--out: least squares gives combinations of parameters and no bodies, so there is no URDF to "
-                         "write; use --method feasible, or --report FILE.json")  # fmt: skip
-    # The report belongs to the robot that is written: it states the errors.
-    json_path = out.with_suffix(".json") if json_path is None and out is not None else json_path
-    train_paths, test_paths = log_paths(args)
-    if args.method != "feasible" and (args.client, args.workers) != (None, None):
-        raise ValueError(
-            f"--client, --workers: workers share the fits of a cross-validation, which --method {args.method} does not have; "
-            "use --method feasible"
-        )
-    # Before logs are read and filtered, which takes longer than the check.
-    if args.method == "trajectory" and len(train_paths) > 1:
-        raise ValueError("--log: --method trajectory fits one log; use --method feasible for several")
-    if args.payload_log and args.method != "feasible":
-        raise ValueError(f"--payload-log: --method {args.method} does not support payloads; use --method feasible")
-    model, given = load_for_repair(args.urdf, args) if args.repair else (load_model(args.urdf, args), [])
-    # Links that were merged into a body are frames, and a payload is identified for a body.
-    if args.payload_body is not None and args.payload_body not in model.body_names:
-        raise ValueError(f"--payload-body {args.payload_body}: the bodies are {', '.join(model.body_names)}")
-    if args.repair:
-        repaired = dict.fromkeys((*given, *dict(inertia_report(model))))
-        print(f"repaired inertias: {', '.join(repaired) or 'none needed'}")
-        model = repair_inertias(model)
-    raws = [raw_log(model, path, args) for path in train_paths]
-    # Held-out samples must not influence the choice of the cut-off.
-    cutoff = log_cutoff(raws if test_paths else [identify.split(raw, args.train)[0] for raw in raws], args)
-    logs = [filter_log(raw, path, args, cutoff) for raw, path in zip(raws, train_paths, strict=True)]
-    names = log_names(train_paths + test_paths)
-
-    gains, loaded = None, [filter_log(raw_log(model, path, args), path, args, cutoff) for path in args.payload_log]
-    if args.payload_mass is not None:
-        # Held-out samples must not influence the gains either.
-        empty = logs if test_paths else [identify.split(log, args.train)[0] for log in logs]
-        gains = find_gains(model, empty, loaded, options, args)
-        logs, loaded = ([gains.scale(log) for log in group] for group in (logs, loaded))
-
+    _check_method(args)
+    model = _load_tree(args)
+    logs = _read_logs(model, options, args)
     watch = Stopwatch()
-    if test_paths:
-        # Separate test logs: one fit is both reported and written.
-        with connect(args) as client:
-            final = judge = make_fit(model, logs, options, args, client)
-        tests = [filter_log(raw_log(model, path, args), path, args, cutoff) for path in test_paths]
-        # The fit predicts true torques, so test logs need the same scale as the training logs.
-        tests = tests if gains is None else [gains.scale(log) for log in tests]
-        test_names, trained = names[len(logs) :], logs
-    else:
-        trained, tests = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
-        test_names = [f"{name} (last {100 * (1 - args.train):.3g} %)" for name in names]
-        # The errors that are reported come from this fit, which has not seen the held-out samples.
-        with connect(args) as client:
-            judge = make_fit(model, trained, options, args, client)
-        # The settings chosen on the training part stay; the parameters are refitted to all samples.
-        final = make_fit(model, logs, resolve_options(options, judge), args)
-    seconds = str(watch)
+    findings = _fit_and_judge(model, logs, options, args)
+    seconds, final = str(watch), findings.result
     # Least squares and the trajectory fit have no choice of settings around the fit.
     fit = final.fit if isinstance(final, RobotFit) else final
-    v_s = float(fit.v_s if isinstance(fit, LeastSquares) else fit.friction.v_s)
-    findings = Findings(
-        model=model,
-        result=final,
-        # Errors on held-out samples are of the fit without them; `final` has seen all.
-        tests=_evaluate(model, judge, test_names, tests),
-        train=_evaluate(model, judge, names[: len(logs)], trained),
-        final=_evaluate(model, final, names[: len(logs)], logs),
-        outcome=_outcome(fit),
-        is_refit=not test_paths,
-        warnings=[],
-        identifiability=identify.identifiability(model, logs, base_terms(fit.terms), v_s=v_s),
-        choice=judge.choice if isinstance(judge, RobotFit) else None,
-    )
-    # The warnings are derived from the other fields, so the list is filled afterwards.
-    findings.warnings.extend(_warnings(findings))
     labels, units = columns_of(model).v, columns_of(model).force_units
     # Gains first: every later number refers to scaled torques.
-    lines = [] if gains is None else [gains_text(gains, labels)]
+    lines = [] if logs.gains is None else [gains_text(logs.gains, labels)]
     lines += [error_table(findings)]
     lines += [f"{args.method} fit of {model.name!r}, {model.nv} joints: {findings.outcome}, in {seconds}"]
     lines += [*(f"warning: {line}" for line in findings.warnings), tables(findings)]
@@ -224,16 +164,17 @@ def run(args: argparse.Namespace) -> None:
     if out is not None and not isinstance(fit, LeastSquares):
         save_urdf(fit.model, out, torques=_extra_torques(fit))
         print(f"Wrote {out}.")
-    payload = None
-    if isinstance(final, RobotFit) and args.payload_log:
+        # The report belongs to the robot that is written: it states the errors.
+        json_path = json_path or out.with_suffix(".json")
+    report = content(findings, _settings(args, logs.cutoff))
+    if isinstance(final, RobotFit) and logs.loaded:
         # The robot's own parameters are those of the fit, so that only the payload is unknown.
-        payload = identify.fit_payload(model, logs, loaded, args.payload_body, robot=final)
+        payload = identify.fit_payload(model, logs.train, logs.loaded, args.payload_body, robot=final)
         print(payload_text(payload))
+        report["payload"] = payload_content(payload)
+    if logs.gains is not None:
+        report["drive_gains"] = gains_content(logs.gains)
     if json_path is not None:
-        report = content(findings, _settings(args, cutoff)) | (
-            {} if payload is None else {"payload": payload_content(payload)}
-        )
-        report |= {} if gains is None else {"drive_gains": gains_content(gains)}
         # Written atomically, as other programs may be reading the file.
         write_text(json_path, json.dumps(report, indent=2) + "\n")
         print(f"Wrote {json_path}.")
@@ -241,6 +182,108 @@ def run(args: argparse.Namespace) -> None:
         # Needs matplotlib, an extra.
         write_text(html, page(findings, labels, units, f"jaxdyn identify: {model.name}", text))
         print(f"Wrote {html}.")
+
+
+def _check_method(args) -> None:
+    """Check that the method supports the other options."""
+    if args.out is not None and args.method == "least-squares":
+        raise ValueError("--out: least squares gives combinations of parameters and no bodies, so there is no URDF to "
+                         "write; use --method feasible, or --report FILE.json")  # fmt: skip
+    if args.method != "feasible" and (args.client, args.workers) != (None, None):
+        raise ValueError(
+            f"--client, --workers: workers share the fits of a cross-validation, which --method {args.method} does not have; "
+            "use --method feasible"
+        )
+    if args.method == "trajectory" and len(args.log) > 1:
+        raise ValueError("--log: --method trajectory fits one log; use --method feasible for several")
+    if args.payload_log and args.method != "feasible":
+        raise ValueError(f"--payload-log: --method {args.method} does not support payloads; use --method feasible")
+
+
+def _load_tree(args) -> Model:
+    """The robot, with its inertias repaired if that is wanted."""
+    model, given = load_for_repair(args.urdf, args) if args.repair else (load_model(args.urdf, args), [])
+    # Links that were merged into a body are frames, and a payload is identified for a body.
+    if args.payload_body is not None and args.payload_body not in model.body_names:
+        raise ValueError(f"--payload-body {args.payload_body}: the bodies are {', '.join(model.body_names)}")
+    if args.repair:
+        repaired = dict.fromkeys((*given, *dict(inertia_report(model))))
+        print(f"repaired inertias: {', '.join(repaired) or 'none needed'}")
+        model = repair_inertias(model)
+    return model
+
+
+class _Logs(NamedTuple):
+    """Filtered logs in true torques: for training, for tests (none: the end of every log), and with a payload.
+
+    `names`: of the training logs and the tests; `cutoff` (Hz) and `gains` of the drives, None where they were not needed.
+    """
+
+    train: list[Log]
+    test: list[Log]
+    loaded: list[Log]
+    names: list[str]
+    cutoff: float | None
+    gains: identify.DriveGains | None
+
+
+def _read_logs(model: Model, options, args) -> _Logs:
+    train_paths, test_paths = log_paths(args)
+    raws = [raw_log(model, path, args) for path in train_paths]
+
+    def share(logs):
+        # Held-out samples must not influence the choice of the cut-off, nor the gains.
+        return logs if test_paths else [identify.split(log, args.train)[0] for log in logs]
+
+    cutoff = log_cutoff(share(raws), args)
+    train = [filter_log(raw, path, args, cutoff) for raw, path in zip(raws, train_paths, strict=True)]
+    test, loaded = (
+        [filter_log(raw_log(model, path, args), path, args, cutoff) for path in paths]
+        for paths in (test_paths, args.payload_log)
+    )
+    gains = None
+    if args.payload_mass is not None:
+        gains = find_gains(model, share(train), loaded, options, args)
+        train, test, loaded = ([gains.scale(log) for log in group] for group in (train, test, loaded))
+    return _Logs(train, test, loaded, log_names(train_paths + test_paths), cutoff, gains)
+
+
+def _fit_and_judge(model: Model, logs: _Logs, options, args) -> Findings:
+    """Fit, and errors on samples that the fit which is judged has not seen."""
+    names = logs.names[: len(logs.train)]
+    if logs.test:
+        # Separate test logs: one fit is both reported and written.
+        trained, tests, test_names = logs.train, logs.test, logs.names[len(logs.train) :]
+        with connect(args) as client:
+            final = judge = make_fit(model, trained, options, args, client)
+    else:
+        trained, tests = (
+            list(part) for part in zip(*(identify.split(log, args.train) for log in logs.train), strict=True)
+        )
+        test_names = [f"{name} (last {100 * (1 - args.train):.3g} %)" for name in names]
+        # The errors that are reported come from this fit, which has not seen the held-out samples.
+        with connect(args) as client:
+            judge = make_fit(model, trained, options, args, client)
+        # The settings chosen on the training part stay; the parameters are refitted to all samples.
+        final = make_fit(model, logs.train, resolve_options(options, judge), args)
+    fit = final.fit if isinstance(final, RobotFit) else final
+    v_s = float(fit.v_s if isinstance(fit, LeastSquares) else fit.friction.v_s)
+    findings = Findings(
+        model=model,
+        result=final,
+        # Errors on held-out samples are of the fit without them; `final` has seen all.
+        tests=_evaluate(model, judge, test_names, tests),
+        train=_evaluate(model, judge, names, trained),
+        final=_evaluate(model, final, names, logs.train),
+        outcome=_outcome(fit),
+        is_refit=not logs.test,
+        warnings=[],
+        identifiability=identify.identifiability(model, logs.train, base_terms(fit.terms), v_s=v_s),
+        choice=judge.choice if isinstance(judge, RobotFit) else None,
+    )
+    # The warnings are derived from the other fields, so the list is filled afterwards.
+    findings.warnings.extend(_warnings(findings))
+    return findings
 
 
 def _extra_torques(fit: Fit) -> dict[str, dict[str, float]]:

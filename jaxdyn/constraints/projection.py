@@ -13,6 +13,7 @@ from jaxdyn.compile import batch, implicit, kernel, mark_invalid, value_and_jvp
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whiten_rows
 from jaxdyn.constraints.rank import (
+    NEAR,
     LeastSquares,
     least_squares,
     min_pivot_of,
@@ -170,10 +171,11 @@ def _correct(scene: Scene, q, v, t, errors, every: Callable, some: Callable):
     if errors:
         A = constraint_jacobian(scene, q, t)
         of_place = some if holonomic.size else None
+        turn = _turn_by_rounding(scene, q, v, t, A[holonomic], some, every) if holonomic.size else 0.0
         errors = _tangential_errors(
             errors,
             (of_place, partial(matmul, A[holonomic]), position_left),
-            (every, partial(matmul, A), velocity_left),
+            (every, partial(matmul, A), velocity_left + turn),
         )
     return q, v, errors, is_open | is_slipping
 
@@ -189,6 +191,20 @@ def _tangential_errors(errors: tuple, *corrections) -> tuple:
 
     # Errors of q alone, or of q and v: fewer errors than corrections are allowed.
     return tuple(tangential(error, *correction) for error, correction in zip(errors, corrections, strict=False))
+
+
+def _turn_by_rounding(scene: Scene, q, v, t, A, some: Callable, every: Callable):
+    """Largest change of v where rounding moves q off the constraints, whose rows are A; zero up to `NEAR` of v.
+
+    At a distance d from a position where branches of the constraints meet it is eps/d^2 of v: very near, rounding decides on
+    which branch the motion goes on, however short its steps are.
+    """
+    eps = float(jnp.finfo(v.dtype).eps)
+    # Rows lose their size where branches meet, but not the rounding of their terms.
+    rounding = jnp.full(A.shape[0], eps * jnp.max(jnp.abs(q), initial=1.0) * jnp.max(jnp.abs(A)))
+    turned = every(velocity_residual(scene, _place(scene, q, some(rounding)), v, t))
+    turn = jnp.max(jnp.abs(turned))
+    return jnp.where(turn > eps**NEAR * jnp.max(jnp.abs(v)), turn, jnp.zeros_like(turn))
 
 
 def enlarge(error, by):
@@ -235,11 +251,13 @@ def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):
     if errors:
         q = lax.stop_gradient(q)
         on, A = Corrections.at(scene, q, t, rank_tol), constraint_jacobian(scene, q, t)
-        of_place = partial(on.shortest, on.of_holonomic) if on.holonomic.size else None
+        of_place, every = partial(on.shortest, on.of_holonomic), partial(on.shortest, on.every)
+        some = A[on.holonomic]
+        turn = _turn_by_rounding(scene, q, state.v, t, some, of_place, every) if on.holonomic.size else 0.0
         errors = _tangential_errors(
             errors,
-            (of_place, partial(matmul, A[on.holonomic]), state.q_distance),
-            (partial(on.shortest, on.every), partial(matmul, A), state.v_distance),
+            (of_place if on.holonomic.size else None, partial(matmul, some), state.q_distance),
+            (every, partial(matmul, A), state.v_distance + turn),
         )
     return state.q, state.v, lax.stop_gradient(errors), jnp.zeros((), q.dtype)
 

@@ -14,7 +14,6 @@ from pinocchio_bridge import assert_close, quick
 import jaxdyn as jd
 from benchmarks.report_cases import test_set
 from jaxdyn import scenes
-from jaxdyn.constraints import projection
 from jaxdyn.constraints.base import holonomic_rows, layout
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.projection import project_state, project_step
@@ -181,9 +180,9 @@ def test_kernels_project_as_matrices_do(name, off):
     place, speed, errors, _ = run(*state)
     with jd.compilation("plain"):
         wanted = quick(partial(project_step, scene))(*state)[:3]
-    assert float(jnp.max(jnp.abs(projection.velocity_residual(scene, place, speed, state[2])))) < 1e-11
-    if projection.holonomic_rows(projection.layout(scene)).size:
-        assert float(jnp.max(jnp.abs(projection.position_residual(scene, place, state[2])))) < 1e-14
+    assert float(jnp.max(jnp.abs(jd.constraints.velocity_residual(scene, place, speed, state[2])))) < 1e-11
+    if holonomic_rows(layout(scene)).size:
+        assert float(jnp.max(jnp.abs(jd.constraints.position_residual(scene, place, state[2])))) < 1e-14
     # A round factors the rows anew where it starts, so the least change is one in another metric by the size of the change.
     size = 20 * off**2 * float(1 + jnp.abs(v).max())
     for x, y in zip(jax.tree.leaves((place, speed, errors)), jax.tree.leaves(wanted), strict=True):

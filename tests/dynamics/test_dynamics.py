@@ -12,8 +12,6 @@ from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
 from jaxdyn import se3
-from jaxdyn.dynamics import centroidal, kinematics
-from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics import world_frame as matrix_form
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
@@ -30,8 +28,8 @@ def values(model, q, v, a, tau, external):
     # The matrix form itself: `dynamics` would compile the recursions too, which have their own tests.
     return {
         "mass_matrix": matrix_form.mass_matrix(model, q),
-        "coriolis": dynamics.coriolis_matrix(model, q, v) @ v,
-        "gravity_force": dynamics.gravity_force(model, q),
+        "coriolis": jd.coriolis_matrix(model, q, v) @ v,
+        "gravity_force": jd.gravity_force(model, q),
         "bias_force": matrix_form.inverse_dynamics(model, q, v, None),
         "inverse_dynamics": matrix_form.inverse_dynamics(model, q, v, a, external),
         "forward_dynamics": matrix_form.forward_dynamics(
@@ -39,10 +37,10 @@ def values(model, q, v, a, tau, external):
         ),
         "kinetic_energy": jd.kinetic_energy(model, q, v),
         "potential_energy": jd.potential_energy(model, q),
-        "center_of_mass": centroidal.center_of_mass(model, q),
-        "centroidal_momentum": centroidal.centroidal_momentum(model, q, v),
-        "centroidal_momentum_matrix": centroidal.centroidal_momentum_matrix(model, q),
-        "torque_regressor": dynamics.torque_regressor(model, q, v, a),
+        "center_of_mass": jd.center_of_mass(model, q),
+        "centroidal_momentum": jd.dynamics.centroidal_momentum(model, q, v),
+        "centroidal_momentum_matrix": jd.dynamics.centroidal_momentum_matrix(model, q),
+        "torque_regressor": jd.dynamics.torque_regressor(model, q, v, a),
     }
 
 
@@ -142,26 +140,26 @@ def test_identities_along_the_motion():
         def energy(q, v):
             return jd.kinetic_energy(model, q, v) + jd.potential_energy(model, q)
 
-        coriolis = dynamics.coriolis_matrix(model, q, v)
+        coriolis = jd.coriolis_matrix(model, q, v)
         acceleration = matrix_form.forward_dynamics(model, q, v, tau)
         free = matrix_form.forward_dynamics(model, q, v, tau_inside)
         last = jnp.zeros_like(external).at[-1].set(external[-1])
         return {
             "skew": (along(lambda q: matrix_form.mass_matrix(model, q)), coriolis + coriolis.T),
-            "gravity": (along(lambda q: jd.potential_energy(model, q)), dynamics.gravity_force(model, q) @ v),
+            "gravity": (along(lambda q: jd.potential_energy(model, q)), jd.gravity_force(model, q) @ v),
             "power": (along_motion(energy, acceleration), v @ tau),
             "momentum": (
-                jnp.sum(model.inertias[:, 0]) * along(lambda q: centroidal.center_of_mass(model, q)),
-                centroidal.centroidal_momentum(model, q, v)[:3],
+                jnp.sum(model.inertias[:, 0]) * along(lambda q: jd.center_of_mass(model, q)),
+                jd.dynamics.centroidal_momentum(model, q, v)[:3],
             ),
-            "free_momentum": along_motion(lambda q, v: centroidal.centroidal_momentum(model, q, v), free),
+            "free_momentum": along_motion(lambda q, v: jd.dynamics.centroidal_momentum(model, q, v), free),
             "wrench": (
-                dynamics.generalized_force(model, q, last),
-                kinematics.body_jacobian(model, q, model.body_names[-1]).T @ external[-1],
+                jd.dynamics.generalized_force(model, q, last),
+                jd.body_jacobian(model, q, model.body_names[-1]).T @ external[-1],
             ),
             "external": (
                 matrix_form.inverse_dynamics(model, q, v, a, external),
-                matrix_form.inverse_dynamics(model, q, v, a) - dynamics.generalized_force(model, q, external),
+                matrix_form.inverse_dynamics(model, q, v, a) - jd.dynamics.generalized_force(model, q, external),
             ),
         }
 
@@ -230,12 +228,10 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
     q, v, a, tau, _ = state
     for function, args in ((matrix_form.forward_dynamics, (q, v, tau)), (matrix_form.inverse_dynamics, (q, v, a))):
         assert operations(function, bare, *args) < operations(function, zero, *args) - 4
-    for function in (dynamics.gravity_force, jd.potential_energy):
+    for function in (jd.gravity_force, jd.potential_energy):
         jaxpr = str(jax.make_jaxpr(lambda m, q, f=function: f(m, q))(bare, q))
         assert "dot_general" not in jaxpr and "sin" not in jaxpr
-        np.testing.assert_array_equal(
-            function(bare, q), np.zeros(model.nv if function is dynamics.gravity_force else ())
-        )
+        np.testing.assert_array_equal(function(bare, q), np.zeros(model.nv if function is jd.gravity_force else ()))
 
 
 LEAVES = ("home", "screws", "inertias", "gravity", "armature")
@@ -245,9 +241,9 @@ def _flat(model, leaves, q, v, u):
     model = model.replace(**leaves)
     terms = [
         matrix_form.forward_dynamics(model, q, v, u),
-        dynamics.coriolis_matrix(model, q, v) @ u,
+        jd.coriolis_matrix(model, q, v) @ u,
         jd.potential_energy(model, q)[None],
-        centroidal.centroidal_momentum(model, q, v),
+        jd.dynamics.centroidal_momentum(model, q, v),
     ]
     return jnp.concatenate(terms)
 
@@ -304,17 +300,17 @@ def test_refusals():
     model = random_tree(1, ["revolute", "spherical"])
     q, v = jnp.asarray([0.0, 1, 0, 0, 0]), jnp.zeros(4)
     for match, call in (
-        ("q has shape", lambda: dynamics.mass_matrix(model, v)),
-        ("a has shape", lambda: dynamics.inverse_dynamics(model, q, v, v[:3])),
-        ("tau has shape", lambda: dynamics.forward_dynamics(model, q, v, q)),
-        ("external has shape", lambda: dynamics.generalized_force(model, q, jnp.zeros((4, 6)))),
+        ("q has shape", lambda: jd.mass_matrix(model, v)),
+        ("a has shape", lambda: jd.inverse_dynamics(model, q, v, v[:3])),
+        ("tau has shape", lambda: jd.forward_dynamics(model, q, v, q)),
+        ("external has shape", lambda: jd.dynamics.generalized_force(model, q, jnp.zeros((4, 6)))),
     ):
         with pytest.raises(ValueError, match=match):
             call()
-    for function in (dynamics.coriolis_matrix, dynamics.bias_force, jd.kinetic_energy):
+    for function in (jd.coriolis_matrix, jd.bias_force, jd.kinetic_energy):
         with pytest.raises(ValueError, match="v has shape"):
             function(model, q, q)
     with pytest.raises(ValueError, match=r"v has shape"):
-        dynamics.torque_regressor(model, q, q, v)
+        jd.dynamics.torque_regressor(model, q, q, v)
     with pytest.raises(ValueError, match=r"q has shape"):
-        centroidal.center_of_mass(model, v)
+        jd.center_of_mass(model, v)

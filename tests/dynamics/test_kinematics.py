@@ -21,7 +21,6 @@ from scipy.linalg import expm
 
 import jaxdyn as jd
 from jaxdyn import se3
-from jaxdyn.dynamics import frame_motion, kinematics
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 CASES = {
@@ -38,15 +37,15 @@ def case(name):
     q, v, _, _, _ = random_states(model, 5, 3)
 
     def values(model, q, v):
-        out = {"bodies": kinematics.forward_kinematics(model, q)}
+        out = {"bodies": jd.forward_kinematics(model, q)}
         for i, frame in enumerate(frames):
-            out[f"pose{i}"] = kinematics.frame_pose(model, q, frame)
-            out[f"body{i}"] = kinematics.body_jacobian(model, q, frame)
-            out[f"spatial{i}"] = kinematics.spatial_jacobian(model, q, frame)
-            out[f"rate{i}"] = frame_motion.jacobian_dot_v(model, q, v, frame)
-            out[f"aligned{i}"] = frame_motion.frame_jacobian(model, q, frame)
-            out[f"velocity{i}"] = frame_motion.frame_velocity(model, q, v, frame)
-            out[f"acceleration{i}"] = frame_motion.frame_acceleration(model, q, v, jnp.cos(v), frame)
+            out[f"pose{i}"] = jd.frame_pose(model, q, frame)
+            out[f"body{i}"] = jd.body_jacobian(model, q, frame)
+            out[f"spatial{i}"] = jd.dynamics.spatial_jacobian(model, q, frame)
+            out[f"rate{i}"] = jd.dynamics.jacobian_dot_v(model, q, v, frame)
+            out[f"aligned{i}"] = jd.frame_jacobian(model, q, frame)
+            out[f"velocity{i}"] = jd.frame_velocity(model, q, v, frame)
+            out[f"acceleration{i}"] = jd.dynamics.frame_acceleration(model, q, v, jnp.cos(v), frame)
         return out
 
     compiled = quick(jax.vmap(values, (None, 0, 0)))
@@ -102,8 +101,8 @@ def test_jacobians_are_derivatives_of_the_pose():
     @jax.vmap
     def along(q, v):
         flow = (jd.configuration_rate(model, q, v),)
-        pose, rate = jax.jvp(lambda q: kinematics.frame_pose(model, q, frame), (q,), flow)
-        _, jacobian_rate = jax.jvp(lambda q: kinematics.body_jacobian(model, q, frame), (q,), flow)
+        pose, rate = jax.jvp(lambda q: jd.frame_pose(model, q, frame), (q,), flow)
+        _, jacobian_rate = jax.jvp(lambda q: jd.body_jacobian(model, q, frame), (q,), flow)
         inverse = se3.inverse(pose)
         return se3.vee(inverse @ rate), se3.vee(rate @ inverse), jacobian_rate @ v
 
@@ -124,7 +123,7 @@ def test_acceleration_is_the_rate_of_the_velocity():
     @jax.vmap
     def along(q, v):
         step = jd.configuration_rate(model, q, v), jnp.cos(v)
-        return jax.jvp(lambda q, v: frame_motion.frame_velocity(model, q, v, frames[-1]), (q, v), step)
+        return jax.jvp(lambda q, v: jd.frame_velocity(model, q, v, frames[-1]), (q, v), step)
 
     velocity, rate = along(q, v)
     assert_close(velocity, np.einsum("sij,sj->si", ours["aligned2"], v))
@@ -136,9 +135,9 @@ def test_joints_name_the_frames_of_their_bodies():
     q = random_states(model, 5, 1)[0][0]
     for joint, body in zip(model.joint_names, model.body_names, strict=True):
         assert joint not in model.frame_names
-        np.testing.assert_array_equal(kinematics.frame_pose(model, q, joint), kinematics.frame_pose(model, q, body))
+        np.testing.assert_array_equal(jd.frame_pose(model, q, joint), jd.frame_pose(model, q, body))
     with pytest.raises(ValueError, match="axes is 'local'"):
-        frame_motion.frame_jacobian(model, q, None, axes="local")
+        jd.frame_jacobian(model, q, None, axes="local")
 
 
 def _hat(screw):
@@ -153,7 +152,7 @@ def test_product_of_exponentials():
     comb = random_tree(6, kinds)
     for model in (chain, comb):
         q = random_states(model, 1, 0)[0][0]
-        poses = quick(kinematics.forward_kinematics)(model, q)
+        poses = quick(jd.forward_kinematics)(model, q)
         want, (q, home, screws) = [], (np.asarray(x) for x in (q, model.home, model.screws))
         for i, parent in enumerate(model.topology.parents):
             above = np.eye(4) if parent < 0 else want[parent]
@@ -165,7 +164,7 @@ def test_program_grows_with_the_logarithm_of_depth():
     def operations(n):
         model = random_tree(0, ["revolute"] * n, parents=list(range(-1, n - 1)))
         with jd.compilation("plain"):
-            jaxpr = jax.make_jaxpr(kinematics.forward_kinematics)(model, jnp.zeros(n))
+            jaxpr = jax.make_jaxpr(jd.forward_kinematics)(model, jnp.zeros(n))
         return str(jaxpr).count("dot_general")
 
     assert operations(256) - operations(128) == operations(128) - operations(64) == 1
@@ -177,8 +176,8 @@ def test_neutral_is_home_and_derivatives_are_finite_there():
     want = []
     for i, parent in enumerate(model.topology.parents):
         want.append((np.eye(4) if parent < 0 else want[parent]) @ np.asarray(model.home[i]))
-    assert_close(kinematics.forward_kinematics(model, q), np.stack(want))
-    second = jax.hessian(lambda q: jnp.sum(kinematics.forward_kinematics(model, q)[-1]))
+    assert_close(jd.forward_kinematics(model, q), np.stack(want))
+    second = jax.hessian(lambda q: jnp.sum(jd.forward_kinematics(model, q)[-1]))
     hessian = quick(second)(q)
     assert np.isfinite(hessian).all() and np.abs(hessian).max() > 0
 
@@ -196,8 +195,8 @@ def test_far_robot_is_as_exact_as_at_home(dtype):
 
         @quick
         def values(model, q, v=v, frame=frame):
-            rate = frame_motion.jacobian_dot_v(model, q, v, frame)
-            return kinematics.body_jacobian(model, q, frame), rate, kinematics.spatial_jacobian(model, q, frame)
+            rate = jd.dynamics.jacobian_dot_v(model, q, v, frame)
+            return jd.body_jacobian(model, q, frame), rate, jd.dynamics.spatial_jacobian(model, q, frame)
 
         at_home, there = values(near, q), values(far, q_far)
         np.testing.assert_array_equal(at_home[0], there[0])
@@ -208,28 +207,28 @@ def test_far_robot_is_as_exact_as_at_home(dtype):
 def test_frames_of_the_world():
     model = random_tree(1, ["revolute", "revolute"])
     q = jnp.asarray([0.3, 0.4])
-    np.testing.assert_array_equal(kinematics.frame_pose(model, q, None), np.eye(4))
-    np.testing.assert_array_equal(kinematics.body_jacobian(model, q, None), np.zeros((6, 2)))
-    np.testing.assert_array_equal(kinematics.spatial_jacobian(model, q, None), np.zeros((6, 2)))
-    np.testing.assert_array_equal(frame_motion.jacobian_dot_v(model, q, q, None), np.zeros(6))
+    np.testing.assert_array_equal(jd.frame_pose(model, q, None), np.eye(4))
+    np.testing.assert_array_equal(jd.body_jacobian(model, q, None), np.zeros((6, 2)))
+    np.testing.assert_array_equal(jd.dynamics.spatial_jacobian(model, q, None), np.zeros((6, 2)))
+    np.testing.assert_array_equal(jd.dynamics.jacobian_dot_v(model, q, q, None), np.zeros(6))
 
 
 def test_one_body_on_a_screw():
     # Closed form: a point at radius 1 about z, pitch 0.5.
     rng = np.random.default_rng(0)
     model = make_model([-1], [np.eye(4)], [[0, 0, 0.5, 0, 0, 1]], [random_inertia(rng)], kinds=["helical"])
-    pose = kinematics.forward_kinematics(model, jnp.asarray([np.pi / 2]))[0]
+    pose = jd.forward_kinematics(model, jnp.asarray([np.pi / 2]))[0]
     assert_close(pose, [[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, np.pi / 4], [0, 0, 0, 1]], 1e-15)
 
 
 def test_refusals():
     model = random_tree(1, ["revolute", "revolute"])
     with pytest.raises(ValueError, match="q has shape"):
-        kinematics.forward_kinematics(model, jnp.zeros(3))
+        jd.forward_kinematics(model, jnp.zeros(3))
     with pytest.raises(ValueError, match="did you mean"):
-        kinematics.frame_pose(model, jnp.zeros(2), "f11")
-    for function in (kinematics.body_jacobian, kinematics.spatial_jacobian):
+        jd.frame_pose(model, jnp.zeros(2), "f11")
+    for function in (jd.body_jacobian, jd.dynamics.spatial_jacobian):
         with pytest.raises(ValueError, match="'nothing' is not"):
             function(model, jnp.zeros(2), "nothing")
     with pytest.raises(ValueError, match="v has shape"):
-        frame_motion.jacobian_dot_v(model, jnp.zeros(2), jnp.zeros(1), "f1")
+        jd.dynamics.jacobian_dot_v(model, jnp.zeros(2), jnp.zeros(1), "f1")

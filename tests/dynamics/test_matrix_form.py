@@ -1,6 +1,6 @@
 """The matrix form in its two frames: link frames against the tree frame, block identities, derivatives of the mass matrix."""
 
-import functools
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,6 @@ import pytest
 from pinocchio_bridge import assert_close, load_robot, quick, random_states, random_tree
 
 import jaxdyn as jd
-from jaxdyn.dynamics import kinematics
-from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics import world_frame as matrix_form
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
@@ -21,7 +19,7 @@ CASES = {
 FEW = pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x != "forest")) for x in CASES])
 
 
-@functools.cache
+@cache
 def case(name):
     model = CASES[name]()
     tip = model.frame_names[-1]
@@ -33,11 +31,11 @@ def case(name):
         world = {
             "mass_matrix": matrix_form.mass_matrix(model, q),
             "mass_matrix_rate": jax.jvp(lambda q: matrix_form.mass_matrix(model, q), (q,), flow)[1],
-            "coriolis_matrix": dynamics.coriolis_matrix(model, q, v),
-            "gravity_force": dynamics.gravity_force(model, q),
+            "coriolis_matrix": jd.coriolis_matrix(model, q, v),
+            "gravity_force": jd.gravity_force(model, q),
             "inverse_dynamics": matrix_form.inverse_dynamics(model, q, v, a),
             "bias_force": matrix_form.inverse_dynamics(model, q, v, None),
-            "tip": kinematics.body_jacobian(model, q, tip),
+            "tip": jd.body_jacobian(model, q, tip),
         }
         products = {name: getattr(link, name) for name in ("mass_matrix", "phi", "Jt", "C0", "Cs", "jacobians")}
         return link, products, world
@@ -111,10 +109,10 @@ def test_derivative_of_the_mass_matrix(parents):
     @quick
     def values(model, q, v):
         return (
-            dynamics.mass_matrix_derivative(model, q),
+            jd.dynamics.mass_matrix_derivative(model, q),
             jax.jacfwd(lambda q: matrix_form.mass_matrix(model, q))(q),
-            dynamics.first_kind_symbols(model, q),
-            dynamics.coriolis_matrix(model, q, v),
+            jd.geometry.christoffel_symbols(model, q, "first"),
+            jd.coriolis_matrix(model, q, v),
         )
 
     closed, automatic, symbols, coriolis = values(model, q, v)
@@ -129,7 +127,7 @@ def test_derivative_of_the_mass_matrix(parents):
 
 def test_refusals():
     model = random_tree(1, ["revolute", "planar"])
-    for function in (dynamics.first_kind_symbols, dynamics.mass_matrix_derivative):
+    for function in (partial(jd.geometry.christoffel_symbols, kind="first"), jd.dynamics.mass_matrix_derivative):
         with pytest.raises(ValueError, match=r"'j1' \(planar\)"):
             function(model, jnp.zeros(4))
     with pytest.raises(ValueError, match="tip is None"):

@@ -58,7 +58,7 @@ def quantities(scene, q, v):
         computed.append(scene.applied_force(q, v, 0.3))
     if scene.constraints:
         rows = base.rows(scene, q, v, 0.3)
-        computed += [jax.tree.leaves(rows), base.position_residual(scene, q, 0.3)]
+        computed += [jax.tree.leaves(rows), jd.constraints.position_residual(scene, q, 0.3)]
     return weigh(computed)
 
 
@@ -220,7 +220,7 @@ def test_lengths_that_do_not_close_are_told_by_the_simulation():
     def run(ground):
         lengths = (1.0, 3.0, 2.5, ground)
         q, v = jd.scenes.four_bar.start(lengths=lengths)
-        return q, v, base.position_residual(jd.scenes.four_bar(lengths=lengths), q)
+        return q, v, jd.constraints.position_residual(jd.scenes.four_bar(lengths=lengths), q)
 
     q, _, residual = run(9.0)
     assert np.isfinite(q).all() and np.abs(residual).max() > 1

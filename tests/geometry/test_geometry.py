@@ -10,7 +10,6 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn import geometry
-from jaxdyn.dynamics import quantities as dynamics
 
 STATES = np.random.default_rng(4).normal(size=(4, 20, 3))
 
@@ -66,9 +65,12 @@ def levi_civita(q, v, w):
     lagrangian = jd.LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * (bumpy(q) @ v)), 3)
     metric = jd.MetricSystem(bumpy, 3)
     pairs |= {
-        "geodesic": (geometry.geodesic_acceleration(bumpy, q, v), dynamics.forward_dynamics(lagrangian, q, v, 0 * v)),
+        "geodesic": (geometry.geodesic_acceleration(bumpy, q, v), jd.forward_dynamics(lagrangian, q, v, 0 * v)),
         "bias": (metric.bias_force(q, v, rest), lagrangian.bias_force(q, v, rest)),
-        "system": (dynamics.first_kind_symbols(metric, q), dynamics.first_kind_symbols(lagrangian, q)),
+        "system": (
+            geometry.christoffel_symbols(metric, q, "first"),
+            geometry.christoffel_symbols(lagrangian, q, "first"),
+        ),
         "of a system": (geometry.connection(metric, q, v, w), geometry.connection(bumpy, q, v, w)),
         "energy": (metric.kinetic_energy(q, v, rest), lagrangian.kinetic_energy(q, v, rest)),
     }
@@ -203,14 +205,14 @@ def test_immersion_equals_multipliers():
             "work": (1 + J.T @ reaction, jnp.ones(2)),
             "kinetic": tuple(energies),
             "potential": (jd.potential_energy(immersed.system, s), 1.3 * 9.81 * q[2]),
-            "gravity": (dynamics.gravity_force(immersed.system, s), 1.3 * 9.81 * J[2]),
+            "gravity": (jd.gravity_force(immersed.system, s), 1.3 * 9.81 * J[2]),
             "coriolis": (
-                dynamics.coriolis_matrix(immersed.system, s, v) @ v + dynamics.gravity_force(immersed.system, s),
-                dynamics.bias_force(immersed.system, s, v),
+                jd.coriolis_matrix(immersed.system, s, v) @ v + jd.gravity_force(immersed.system, s),
+                jd.bias_force(immersed.system, s, v),
             ),
             "metric": (
-                dynamics.mass_matrix(immersed.system, s),
-                jd.geometry.pull_back(lambda x: dynamics.mass_matrix(particle, x), torus)(s),
+                jd.mass_matrix(immersed.system, s),
+                jd.geometry.pull_back(lambda x: jd.mass_matrix(particle, x), torus)(s),
             ),
         }
 
@@ -270,7 +272,7 @@ def test_moving_immersion_is_a_bead_on_a_turning_hoop():
     @jax.vmap
     def both(s, v, t):
         s, v, t = s[:1], v[:1], t[0]
-        a = dynamics.forward_dynamics(system, s, v, jnp.zeros(1), t)
+        a = jd.forward_dynamics(system, s, v, jnp.zeros(1), t)
         (angle,) = s
         want = rate**2 * jnp.sin(angle) * jnp.cos(angle) - 9.81 / radius * jnp.sin(angle)
         power = jax.jvp(
@@ -296,9 +298,7 @@ def test_geodesic_of_the_sphere_is_a_great_circle():
     rate = jnp.sqrt(jnp.sum(speed * speed)) / 1.7
     circle = jnp.cos(rate * ts)[:, None] * x[None] + jnp.sin(rate * ts)[:, None] * (speed / rate)[None]
     assert_close(jax.vmap(sphere)(solution.q), circle, 1e-9)  # the tolerance of the steps, times their number
-    half = quick(lambda q, v: dynamics.forward_dynamics(system, q, v, 0 * v))(
-        *(x.astype(jnp.float32) for x in (q0, v0))
-    )
+    half = quick(lambda q, v: jd.forward_dynamics(system, q, v, 0 * v))(*(x.astype(jnp.float32) for x in (q0, v0)))
     assert half.dtype == jnp.float32
     s, c = np.sin(1.1), np.cos(1.1)
     assert_close(half, [s * c * 0.9**2, -2 * c / s * 0.4 * 0.9], 1e-5)
@@ -311,13 +311,11 @@ def test_bad_immersions_and_metrics_are_refused():
     with pytest.raises(ValueError, match=r"the immersion has rank 1 at s = \[0.0, 0.4\], expected 2"):
         jd.geometry.pull_back(bumpy, sphere)(pole)
     with pytest.raises(ValueError, match=r"the immersion has rank 1 at s = \[0.0, 0.4\], t = 0, expected 2"):
-        dynamics.forward_dynamics(on_sphere, pole, one, one)
+        jd.forward_dynamics(on_sphere, pole, one, one)
     with pytest.raises(ValueError, match=r"the immersion has rank 1 at s = \[0.0, 0.4\], t = 0, expected 2"):
         jd.simulate(on_sphere, pole, one, jnp.asarray([0.0, 1.0]))
     with pytest.raises(ValueError, match=r"xi returned shapes \[\(3,\)\], expected \[\(2,\)\]"):
-        dynamics.mass_matrix(
-            jd.geometry.constrain_by_immersion(jd.MetricSystem(lambda q: jnp.eye(2), 2), sphere, 2), one
-        )
+        jd.mass_matrix(jd.geometry.constrain_by_immersion(jd.MetricSystem(lambda q: jnp.eye(2), 2), sphere, 2), one)
     with pytest.raises(ValueError, match="a scene has 1 constraints"):
         jd.geometry.constrain_by_immersion(jd.Scene(particle, (jd.Holonomic(on_torus),)), torus, 2)
     with pytest.raises(ValueError, match=r"field returned shape \(2, 2\), expected \(3, ...\)"):

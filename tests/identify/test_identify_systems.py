@@ -10,7 +10,6 @@ from jax.tree_util import Partial
 
 import jaxdyn as jd
 from jaxdyn import identify, scenes
-from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size
 
@@ -99,7 +98,7 @@ def test_parameters_of_a_lagrangian_are_recovered(swung, error, method):
         < 1e-5
         < 1
         < identify.torque_error(
-            jax.vmap(lambda q, v, a: dynamics.inverse_dynamics(nominal(), q, v, a))(swung.q, swung.v, swung.a),
+            jax.vmap(lambda q, v, a: jd.inverse_dynamics(nominal(), q, v, a))(swung.q, swung.v, swung.a),
             swung.tau,
         )
     )

@@ -348,13 +348,15 @@ def test_a_parallelogram_passes_its_flat_position(in_plane):
 
 @pytest.mark.long
 @pytest.mark.parametrize("in_plane", [True, pytest.param(False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("tolerance", "min_share", "error", "loss"), [(1e-8, 0.97, 1e-7, 4e-5), (1e-10, 0.75, 1e-8, 4e-7)])
+@pytest.mark.parametrize(
+    ("tolerance", "min_share", "error", "loss"), [(1e-8, 0.98, 1e-10, 3e-5), (1e-10, 0.8, 1e-10, 3e-7)]
+)
 def test_antiparallelograms_pass_their_flat_position(tolerance, min_share, error, loss, in_plane):
-    """sin(rocker/2) cos(crank/2) = -2 cos(rocker/2) sin(crank/2), at 200 rates.
+    """sin(rocker/2) cos(crank/2) = -2 cos(rocker/2) sin(crank/2), at 2000 rates.
 
     At a distance d from it, rounding turns the velocity by eps/d^2. A run with steps that end where this exceeds the tolerance
-    says so. How near steps end is chance, so the bounds are those of shares: of 4000 rates 0.6 to 0.9 % and 15 to 18 % stop; of
-    the energy of 30 J 99 % of the others lose up to 1.7e-5 and 1.5e-7 J, and one of them 2e-4 J.
+    says so, and none goes on as a parallelogram. How near steps end is chance, so the bounds are those of shares: of 4000 rates
+    0.6 to 0.9 % and 15 to 18 % stop; of 30 J 99 % of the others lose up to 1.7e-5 and 1.5e-7 J, and one 2e-4 J.
     """
     scene, q, v = equal_cranks(-0.5, 2 * np.arctan(2 * np.tan(0.25)), 1.0, in_plane)
 
@@ -364,7 +366,7 @@ def test_antiparallelograms_pass_their_flat_position(tolerance, min_share, error
         computed = jd.simulate(scene, q, rate * v, ts, stepsize=within(tolerance), **options)
         return computed.q, computed.energy, computed.result.index
 
-    q, energy, codes = map(np.asarray, jax.jit(run)(jnp.linspace(3.2, 4.8, 200)))
+    q, energy, codes = map(np.asarray, jax.jit(run)(jnp.linspace(3.2, 4.8, 2000)))
     succeeded = codes == jd.RESULTS.successful.index
     assert succeeded.mean() >= min_share
     assert (succeeded | (codes == jd.RESULTS.dt_min_reached.index)).all()
@@ -372,7 +374,7 @@ def test_antiparallelograms_pass_their_flat_position(tolerance, min_share, error
     assert (crank[:, 0] < -0.05).all() and (crank[:, -1] > 0.05).all()
     np.testing.assert_allclose(np.sin(rocker) * np.cos(crank), -2 * np.cos(rocker) * np.sin(crank), atol=error)
     losses = np.ptp(energy[succeeded], axis=1)
-    assert np.quantile(losses, 0.97) < loss
+    assert np.quantile(losses, 0.99) < loss
     assert losses.max() < 1e-3
 
 

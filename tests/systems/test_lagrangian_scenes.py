@@ -8,7 +8,6 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn import geometry, scenes, se3
-from jaxdyn.dynamics import quantities as dynamics
 
 G = 9.81
 STATES = np.random.default_rng(8).normal(size=(3, 20, 4))
@@ -36,14 +35,14 @@ def first_pages(q, v, a):
     pairs = {}
     particle = scenes.particle_in_plane(mass=1.3).system
     newton = 1.3 * a[:2] + jnp.asarray([0.0, 1.3 * G])
-    pairs["particle"] = dynamics.inverse_dynamics(particle, q[:2], v[:2], a[:2]), newton
+    pairs["particle"] = jd.inverse_dynamics(particle, q[:2], v[:2], a[:2]), newton
     pairs["particle P"] = geometry.flat(particle, q[:2], v[:2]), 1.3 * v[:2]
 
     swing = scenes.pendulum(mass=1.3, length=0.7).system
     angle, rate, turn = q[:1], v[:1], a[:1]
     pairs |= {
         "swing": (
-            dynamics.inverse_dynamics(swing, angle, rate, turn),
+            jd.inverse_dynamics(swing, angle, rate, turn),
             1.3 * 0.49 * turn + 1.3 * G * 0.7 * jnp.sin(angle),
         ),
         "swing T": (jd.kinetic_energy(swing, angle, rate), 1.3 * 0.49 * rate[0] ** 2 / 2),
@@ -54,15 +53,15 @@ def first_pages(q, v, a):
     sphere = scenes.spherical_pendulum_in_angles(mass=1.3, length=0.7).system
     s, c, ml = jnp.sin(q[0]), jnp.cos(q[0]), 1.3 * 0.7
     printed = ml * 0.7 * jnp.stack([a[0] - s * c * v[1] ** 2 + G / 0.7 * s, s**2 * a[1] + 2 * s * c * v[0] * v[1]])
-    moving = dynamics.forward_dynamics(sphere, q, v, jnp.zeros(2))
+    moving = jd.forward_dynamics(sphere, q, v, jnp.zeros(2))
     momentum = lambda q, v: ml * 0.7 * jnp.sin(q[0]) ** 2 * v[1]  # noqa: E731
     printed_lagrangian = ml * 0.7 / 2 * (v[0] ** 2 + s**2 * v[1] ** 2) + ml * G * c
     pairs |= {
         "sphere L": (sphere.value(q, v, jnp.zeros(())), printed_lagrangian),
-        "sphere": (dynamics.inverse_dynamics(sphere, q, v, a), printed),
-        "sphere M": (dynamics.mass_matrix(sphere, q), ml * 0.7 * jnp.diag(jnp.stack([1 + 0 * s, s**2]))),
-        "sphere N": (dynamics.gravity_force(sphere, q), ml * G * jnp.stack([s, 0 * s])),
-        "sphere C": (dynamics.coriolis_matrix(sphere, q, v), ml * 0.7 * s * c * matrix([[0, -v[1]], [v[1], v[0]]])),
+        "sphere": (jd.inverse_dynamics(sphere, q, v, a), printed),
+        "sphere M": (jd.mass_matrix(sphere, q), ml * 0.7 * jnp.diag(jnp.stack([1 + 0 * s, s**2]))),
+        "sphere N": (jd.gravity_force(sphere, q), ml * G * jnp.stack([s, 0 * s])),
+        "sphere C": (jd.coriolis_matrix(sphere, q, v), ml * 0.7 * s * c * matrix([[0, -v[1]], [v[1], v[0]]])),
         "first integral": (jax.jvp(momentum, (q, v), (v, moving))[1], 0.0 * s),
     }
 
@@ -73,21 +72,21 @@ def first_pages(q, v, a):
     gamma = jnp.zeros((2, 2, 2)).at[(0, 0, 0), (0, 1, 1), (1, 0, 1)].set(-bs).at[1, 0, 0].set(bs)
     C = matrix([[-bs * v[1], -bs * (v[0] + v[1])], [bs * v[0], 0.0]])
     c1, c12 = jnp.cos(q[0]), jnp.cos(q[0] + q[1])
-    rate = jax.jvp(lambda q: dynamics.mass_matrix(arm, q), (q,), (v,))[1]
-    computed = dynamics.coriolis_matrix(arm, q, v)
+    rate = jax.jvp(lambda q: jd.mass_matrix(arm, q), (q,), (v,))[1]
+    computed = jd.coriolis_matrix(arm, q, v)
     return pairs | {
         "arm M": (
-            dynamics.mass_matrix(arm, q),
+            jd.mass_matrix(arm, q),
             matrix([[alpha + 2 * beta * c2, delta + beta * c2], [delta + beta * c2, delta]]),
         ),
-        "arm symbols": (dynamics.first_kind_symbols(arm, q), gamma),
+        "arm symbols": (geometry.christoffel_symbols(arm, q, "first"), gamma),
         "arm C": (computed, C),
         "arm skew": (rate - 2 * computed, bs * (2 * v[0] + v[1]) * jnp.asarray([[0.0, 1.0], [-1.0, 0.0]])),
         "arm N": (
-            dynamics.gravity_force(arm, q),
+            jd.gravity_force(arm, q),
             G * jnp.stack([m1 * r1 * c1 + m2 * (l1 * c1 + r2 * c12), m2 * r2 * c12]),
         ),
-        "arm h": (dynamics.bias_force(arm, q, v), computed @ v + dynamics.gravity_force(arm, q)),
+        "arm h": (jd.bias_force(arm, q, v), computed @ v + jd.gravity_force(arm, q)),
     }
 
 
@@ -96,9 +95,9 @@ def test_first_pages_of_mechanics():
     check(first_pages(*states(4)))
     arm = scenes.planar_arm().system
     q, v, a = jnp.asarray([0.0, np.pi / 3]), jnp.asarray([1.0, 2.0]), jnp.asarray([1.0, -1.0])
-    assert_close(dynamics.inverse_dynamics(arm, q, v, a), [-0.90702503, 0.43712813], 1e-8)  # as many digits are given
-    assert_close(dynamics.mass_matrix(arm, q), [[1.648, 0.338], [0.338, 0.178]], 1e-13)
-    assert_close(dynamics.coriolis_matrix(arm, q, v), [[-0.55425626, -0.83138439], [0.27712813, 0]], 1e-8)
+    assert_close(jd.inverse_dynamics(arm, q, v, a), [-0.90702503, 0.43712813], 1e-8)  # as many digits are given
+    assert_close(jd.mass_matrix(arm, q), [[1.648, 0.338], [0.338, 0.178]], 1e-13)
+    assert_close(jd.coriolis_matrix(arm, q, v), [[-0.55425626, -0.83138439], [0.27712813, 0]], 1e-8)
 
 
 def printed_spatial_arm(theta):
@@ -163,18 +162,18 @@ def spatial_arm(q, v, a):
         at_joint = R.T @ torque + jnp.cross(jnp.asarray(CENTRES[i]), R.T @ force)
         wrenches.append(jnp.concatenate([R.T @ force, at_joint]))
     whole = jax.jacfwd(lambda q: jd.center_of_mass(model, q))(q)
-    mass_rate = jax.jvp(lambda q: dynamics.mass_matrix(model, q), (q,), (v,))[1]
+    mass_rate = jax.jvp(lambda q: jd.mass_matrix(model, q), (q,), (v,))[1]
     h1, h2 = 0.2, 0.5 - 0.25 * jnp.sin(q[1])
     h3 = 0.5 - 0.4 * jnp.sin(q[1]) - 0.15 * jnp.sin(q[1] + q[2])
-    mass_matrix, gravity = dynamics.mass_matrix(model, q), dynamics.gravity_force(model, q)
-    coriolis = dynamics.bias_force(model, q, v) - gravity
+    mass_matrix, gravity = jd.mass_matrix(model, q), jd.gravity_force(model, q)
+    coriolis = jd.bias_force(model, q, v) - gravity
     pairs = {
         "J1": (computed[0], jnp.zeros((6, 3)).at[5, 0].set(1.0)),
         "J2": (computed[1], J2),
         "J3": (computed[2], J3),
         "M": (mass_matrix, M),
         "M by link Jacobians": (by_links, M),
-        "symbols": (dynamics.first_kind_symbols(model, q), gamma),
+        "symbols": (geometry.christoffel_symbols(model, q, "first"), gamma),
         "C v": (coriolis, jnp.einsum("ijk,j,k->i", gamma, v, v)),
         "C v by link Jacobians": (bias, coriolis),
         "tensor": (jnp.einsum("ijk,j,k->i", gamma, v, v), in_space_axes @ v),
@@ -184,7 +183,7 @@ def spatial_arm(q, v, a):
         "V": (jd.potential_energy(model, q), G * (3.0 * h1 + 2.0 * h2 + 1.0 * h3)),
         "N": (gravity, N),
         "weight at the centre of mass": (-sum(LINK_MASSES) * whole.T @ jnp.asarray([0.0, 0.0, -G]), N),
-        "wrenches": (dynamics.generalized_force(model, q, jnp.stack(wrenches)), pushed),
+        "wrenches": (jd.dynamics.generalized_force(model, q, jnp.stack(wrenches)), pushed),
         "weights through centre-of-mass Jacobians": (-weight, N),
     }
     return pairs, (mass_matrix, coriolis, gravity)
@@ -236,32 +235,32 @@ def test_rigid_body_in_euler_angles():
         q = q.at[1].set(1.2 + 0.3 * jnp.sin(q[1]))  # away from sin(theta) = 0
         E, (w, w_rate) = rates(q), jax.jvp(lambda q, v: rates(q) @ v, (q, v), (v, a))
         torque = moments * w_rate + jnp.cross(w, moments * w)
-        about_axes = dynamics.inverse_dynamics(system, q, v, a)
+        about_axes = jd.inverse_dynamics(system, q, v, a)
         st, ct, sp, cp = jnp.sin(q[1]), jnp.cos(q[1]), jnp.sin(q[2]), jnp.cos(q[2])
         printed = matrix([[-cp / st, sp, cp * ct / st], [sp / st, cp, -sp * ct / st], [0, 0, 1]])
-        acceleration = dynamics.forward_dynamics(system, q, v, about_axes)
+        acceleration = jd.forward_dynamics(system, q, v, about_axes)
         sphi, cphi = jnp.sin(q[0]), jnp.cos(q[0])
         in_space = matrix([[0, -sphi, st * cphi], [0, cphi, st * sphi], [1, 0, ct]])
         b = jnp.cross(moments * w, w) / moments  # Arnold's B(w, w)
-        free = dynamics.forward_dynamics(model, euler_quaternion(q), w, jnp.zeros(3))
+        free = jd.forward_dynamics(model, euler_quaternion(q), w, jnp.zeros(3))
         return {
             "turned": (matrix_of(q) @ E, in_space),
             "determinant": (jnp.linalg.det(E), -st),
             "free": (free, b),
-            "metric": (dynamics.mass_matrix(system, q), E.T @ jnp.diag(moments) @ E),
+            "metric": (jd.mass_matrix(system, q), E.T @ jnp.diag(moments) @ E),
             "torque": (about_axes, E.T @ torque),
             "body axes": (printed @ about_axes, torque),
             "geodesic": (geometry.flat(system, q, geometry.covariant_rate(system, q, v, v, a)), about_axes),
             "acceleration": (acceleration, a),
-            "model": (dynamics.forward_dynamics(model, euler_quaternion(q), w, torque), w_rate),
+            "model": (jd.forward_dynamics(model, euler_quaternion(q), w, torque), w_rate),
             "velocity": (immersed.velocities(q, v, jnp.zeros(()))[0], w),
-            "immersed": (dynamics.inverse_dynamics(immersed, q, v, a), about_axes),
-            "immersed bias": (dynamics.bias_force(immersed, q, v), about_axes - dynamics.mass_matrix(system, q) @ a),
+            "immersed": (jd.inverse_dynamics(immersed, q, v, a), about_axes),
+            "immersed bias": (jd.bias_force(immersed, q, v), about_axes - jd.mass_matrix(system, q) @ a),
         }
 
     check(both(*states(3)))
     q, w = jnp.asarray([1.0, 0.0, 0.0, 0.0]), jnp.asarray([0.3, 0.5, -0.7])
-    assert_close(dynamics.forward_dynamics(model, q, w, jnp.zeros(3)), [0.35, -0.21, -0.05], 1e-14)
+    assert_close(jd.forward_dynamics(model, q, w, jnp.zeros(3)), [0.35, -0.21, -0.05], 1e-14)
 
 
 def hanging(angle):
@@ -313,14 +312,14 @@ def test_double_pendulum_in_four_formulations():
             "metric by pull-back": (geometry.pull_back(separate, ends)(angles), rho),
             "symbols by pull-back": (geometry.christoffel_symbols(geometry.pull_back(separate, ends), angles), gamma),
             "forces by pull-back": (geometry.pull_back(lambda x: forces, ends)(angles), -pull),
-            "metric": (dynamics.mass_matrix(points, angles), rho),
+            "metric": (jd.mass_matrix(points, angles), rho),
             "symbols": (geometry.christoffel_symbols(points, angles), gamma),
-            "motion": (dynamics.inverse_dynamics(points, angles, rates, a), rho @ a + turning + pull),
+            "motion": (jd.inverse_dynamics(points, angles, rates, a), rho @ a + turning + pull),
         }
 
     check(both(*states(2)))
     q, v = scenes.double_pendulum.start()
-    assert_close(dynamics.forward_dynamics(points, q, v, 0 * q), [-7.48670516, 11.47569246], 1e-8)  # digits given
+    assert_close(jd.forward_dynamics(points, q, v, 0 * q), [-7.48670516, 11.47569246], 1e-8)  # digits given
 
 
 @pytest.mark.long
@@ -333,15 +332,15 @@ def test_lagrangian_takes_no_more_operations_than_bodies():
 
     batch = jnp.ones((4096, 2))
     count = {
-        name: operations(lambda q, scene=scene: dynamics.forward_dynamics(scene.system, q, q, q), batch)
+        name: operations(lambda q, scene=scene: jd.forward_dynamics(scene.system, q, q, q), batch)
         for name in ("lagrangian", "immersion", "model")
         for scene in (scenes.double_pendulum(formulation=name),)
     }
     assert 0 < count["lagrangian"] < count["immersion"] <= count["model"], count
     metric = scenes.rigid_body_in_euler_angles().system
-    symbols = lambda q, v: jnp.einsum("ijk,j,k->i", dynamics.first_kind_symbols(metric, q), v, v)  # noqa: E731
+    symbols = lambda q, v: jnp.einsum("ijk,j,k->i", geometry.christoffel_symbols(metric, q, "first"), v, v)  # noqa: E731
     state = jnp.ones((4096, 3))
-    bias = operations(lambda q, v: dynamics.bias_force(metric, q, v), state, state)
+    bias = operations(lambda q, v: jd.bias_force(metric, q, v), state, state)
     assert 0 < 1.5 * bias < operations(symbols, state, state)
 
 
@@ -368,7 +367,7 @@ def test_disk_and_link_in_contact():
         )
         dry = jnp.stack([-m2 * G * k, 0 * k, m2 * G * k, torque - a * m2 * G])
         friction = jnp.stack([f1 * s * k + f1 * c - f2, -f1 - f2, -f1 * s * k - f1 * c, a * f1 * s])
-        pulled = scene.applied_force(q, v) - dynamics.gravity_force(scene.system, q)
+        pulled = scene.applied_force(q, v) - jd.gravity_force(scene.system, q)
         disk, link = jd.geometry.reaction_force(scene, q, v)
         nu, u = link[1] / c, disk[1] + link[1]
         zero = jnp.zeros(())
@@ -376,7 +375,7 @@ def test_disk_and_link_in_contact():
         return {
             "touching": (jnp.stack([(y1 - z1) * s + (y2 - height) * c, height]), jnp.ones(2)),
             "along": ((y1 - z1) * c - (y2 - height) * s, -along),
-            "metric": (dynamics.mass_matrix(scene.system, q), rho),
+            "metric": (jd.mass_matrix(scene.system, q), rho),
             "force": (pulled, dry + friction),
             "reaction on the disk": (disk, jnp.stack([-nu * s, u - nu * c, zero])),
             "reaction on the link": (link, jnp.stack([nu * s, nu * c, -nu * along])),
@@ -422,7 +421,7 @@ def test_derivatives_at_rest():
         scene = scenes.double_pendulum(
             formulation=formulation, masses=(x[0], x[1]), length=x[2], reaches=(x[3], x[4]), gravity=x[5]
         )
-        return dynamics.forward_dynamics(scene.system, x[6:8], x[8:10], jnp.zeros(2))
+        return jd.forward_dynamics(scene.system, x[6:8], x[8:10], jnp.zeros(2))
 
     at = jnp.asarray([1.0, 0.5, 1.0, 0.5, 0.35, G, 0.0, 0.0, 0.0, 0.0])
     both = quick(
@@ -476,7 +475,7 @@ def test_inertia_of_a_box_and_its_change_of_frame():
     pose = se3.exp(jnp.asarray([0.3, -0.2, 0.5, 0.4, 1.1, -0.6]))
     centred, moved = (scenes.free_box(mass=mass, size=(l, w, h), frame=frame).system for frame in (None, pose))
     q, V = scenes.free_box.start(velocity=(0.3, -1.0, 0.4))
-    computed = quick(lambda q, V: [(dynamics.mass_matrix(m, q), jd.kinetic_energy(m, q, V)) for m in (centred, moved)])
+    computed = quick(lambda q, V: [(jd.mass_matrix(m, q), jd.kinetic_energy(m, q, V)) for m in (centred, moved)])
     ((at_centre, energy), (away, other)), Ad = computed(q, V), se3.Ad(pose)
     assert_close(at_centre, M, 1e-15)
     assert_close(energy, mass * V[:3] @ V[:3] / 2 + V[3:] @ (moments * V[3:]) / 2, 1e-14)

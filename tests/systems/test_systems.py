@@ -7,7 +7,6 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
-from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.systems.mass_factor import solve_positive
 
 # Planar 2R arm of EQUATIONS section 1: m, l1, r, I.
@@ -66,12 +65,12 @@ def bodies():
 @quick
 def everything(system, q, v, a):
     return {
-        "mass_matrix": dynamics.mass_matrix(system, q),
-        "bias_force": dynamics.bias_force(system, q, v),
-        "gravity_force": dynamics.gravity_force(system, q),
-        "coriolis": dynamics.coriolis_matrix(system, q, v) @ v,
-        "inverse_dynamics": dynamics.inverse_dynamics(system, q, v, a),
-        "forward_dynamics": dynamics.forward_dynamics(system, q, v, a),
+        "mass_matrix": jd.mass_matrix(system, q),
+        "bias_force": jd.bias_force(system, q, v),
+        "gravity_force": jd.gravity_force(system, q),
+        "coriolis": jd.coriolis_matrix(system, q, v) @ v,
+        "inverse_dynamics": jd.inverse_dynamics(system, q, v, a),
+        "forward_dynamics": jd.forward_dynamics(system, q, v, a),
         "kinetic": jd.kinetic_energy(system, q, v),
         "potential": jd.potential_energy(system, q),
     }
@@ -106,7 +105,7 @@ def test_gyroscopic_and_moving_systems():
 
     system = jd.LagrangianSystem(moving, 2, parameters={"m": 2.0, "b": field})
     q, v = jnp.array([0.4, -1.2]), jnp.array([0.8, 0.3])
-    bias = quick(lambda q, v: dynamics.bias_force(system, q, v, 0.9))
+    bias = quick(lambda q, v: jd.bias_force(system, q, v, 0.9))
     want = np.array([2.0 * pull - field * v[1], field * v[0]])  # m xdd + m pull - b ydot = 0, m ydd + b xdot = 0
     assert_close(bias(q, v), want, 1e-14)
     assert_close(jd.kinetic_energy(system, q, v, 0.9), 1.0 * jnp.sum(v * v), 1e-14)
@@ -117,7 +116,7 @@ def test_parameters_are_differentiated_and_batched():
 
     def acceleration(scale):
         system = jd.LagrangianSystem(lagrangian, 2, parameters=PARAMETERS | {"mass": PARAMETERS["mass"] * scale})
-        return dynamics.forward_dynamics(system, q, v, tau)
+        return jd.forward_dynamics(system, q, v, tau)
 
     step = 1e-5
     one, scales = quick(acceleration), jnp.array([0.5, 1.0, 2.0])
@@ -136,7 +135,7 @@ def test_small_systems_are_solved_without_lapack():
         assert_close(solve(whole[:n, :n], right), np.linalg.solve(whole[:n, :n], right), 1e-13)
     assert np.isnan(solve(np.asarray([[1.0, 2.0], [2.0, 1.0]]), np.ones(2))).all()
     system, batch = jd.LagrangianSystem(lagrangian, 2, parameters=PARAMETERS), jnp.ones((3, 2))
-    motion = jax.jit(jax.vmap(lambda q: dynamics.forward_dynamics(system, q, q, q)))
+    motion = jax.jit(jax.vmap(lambda q: jd.forward_dynamics(system, q, q, q)))
     assert "lapack" not in motion.lower(batch).as_text()
 
 
@@ -162,10 +161,10 @@ def test_coriolis_matrix_holds_gyroscopic_terms():
     q, v = jnp.asarray(q), jnp.asarray(v)
     C, N, h, rate = quick(
         lambda q, v: (
-            dynamics.coriolis_matrix(system, q, v),
-            dynamics.gravity_force(system, q),
-            dynamics.bias_force(system, q, v),
-            jax.jvp(lambda q: dynamics.mass_matrix(system, q), (q,), (v,))[1],
+            jd.coriolis_matrix(system, q, v),
+            jd.gravity_force(system, q),
+            jd.bias_force(system, q, v),
+            jax.jvp(lambda q: jd.mass_matrix(system, q), (q,), (v,))[1],
         )
     )(q, v)
     field = q[1] ** 2  # of the one-form q0 q1^2 dq1
@@ -208,7 +207,7 @@ def test_starts_without_a_motion_are_refused():
 
     def start(lagrangian, nq, q=0.0, **options):
         system, state = jd.LagrangianSystem(lagrangian, nq, **options), jnp.full(nq, q)
-        return lambda: dynamics.forward_dynamics(system, state, jnp.zeros(nq), jnp.zeros(nq))
+        return lambda: jd.forward_dynamics(system, state, jnp.zeros(nq), jnp.zeros(nq))
 
     idle = (
         r"mass matrix of this LagrangianSystem has rank 1 of 2 at q = \[0.0, 0.0\].*velocity \[.*1.0.*\] moves no mass"
@@ -230,7 +229,7 @@ def test_starts_without_a_motion_are_refused():
         jd.simulate(jd.Scene(jd.LagrangianSystem(swing, 2)), jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
     flat = jd.MetricSystem(lambda q: jnp.ones((2, 2)), 2)
     with pytest.raises(ValueError, match="this MetricSystem has"):
-        dynamics.forward_dynamics(flat, jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
+        jd.forward_dynamics(flat, jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
 
 
 def test_bad_systems_are_refused():
@@ -241,11 +240,11 @@ def test_bad_systems_are_refused():
     system = jd.ExplicitSystem(lambda q: jnp.eye(3), lambda q, v: v, 2)
     q = jnp.zeros(2)
     for match, call in (
-        ("mass_matrix returned shape", lambda: dynamics.mass_matrix(system, q)),
+        ("mass_matrix returned shape", lambda: jd.mass_matrix(system, q)),
         ("no potential energy", lambda: jd.potential_energy(system, q)),
-        ("q has shape", lambda: dynamics.mass_matrix(system, jnp.zeros(3))),
-        ("wrenches on bodies", lambda: dynamics.forward_dynamics(system, q, q, q, external=jnp.zeros((1, 6)))),
-        ("lagrangian returned shape", lambda: dynamics.mass_matrix(jd.LagrangianSystem(lambda q, v: v * v, 2), q)),
+        ("q has shape", lambda: jd.mass_matrix(system, jnp.zeros(3))),
+        ("wrenches on bodies", lambda: jd.forward_dynamics(system, q, q, q, external=jnp.zeros((1, 6)))),
+        ("lagrangian returned shape", lambda: jd.mass_matrix(jd.LagrangianSystem(lambda q, v: v * v, 2), q)),
     ):
         with pytest.raises(ValueError, match=match):
             call()
