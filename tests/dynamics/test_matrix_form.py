@@ -128,7 +128,7 @@ def test_derivative_of_the_mass_matrix(parents):
 def test_refusals():
     model = random_tree(1, ["revolute", "planar"])
     for function in (partial(jd.geometry.christoffel_symbols, kind="first"), jd.dynamics.mass_matrix_derivative):
-        with pytest.raises(ValueError, match=r"'j1' \(planar\)"):
+        with pytest.raises(ValueError, match="planar"):
             function(model, jnp.zeros(4))
     with pytest.raises(ValueError, match="tip is None"):
         _ = quick(jd.newton_euler_matrices)(random_tree(1, ["revolute"]), jnp.zeros(1), jnp.zeros(1)).Jt

@@ -52,7 +52,7 @@ from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
 
 STICKS, SLIDES = 41, 81  # guesses in which all elements stick, or slide; the last one
-_ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
+_ANGLE = 1.5e-7  # rad, up to which a direction is known, where that is more than rounding
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
 _ROOM = 2e-3  # of the friction of all elements, by which the friction of some that stick may grow beyond the cone
 _WEIGHT = 32  # changes of direction for which there is the same room as for one of a mode
@@ -203,7 +203,8 @@ def _change_first(elements: Elements, _, problem: Problem, choice: Choice, __) -
         negative=mode.negative != reverses,
     )
     # Directions follow when the modes agree.
-    moves = (jnp.sum(turned * slip, 1) < 1 - _ANGLE) & ~wrong.any()
+    angle = max(_ANGLE, 4 * float(jnp.finfo(slip.dtype).eps))
+    moves = (jnp.sum((turned - slip) ** 2, 1) > angle**2) & ~wrong.any()
     slip = jnp.where(leaves[:, None], against, jnp.where(moves[:, None], turned, slip))
     changes = changes + jnp.where(wrong.any(), _WEIGHT, 1).astype(jnp.int32)
     done = ~(wrong.any() | moves.any()) | (changes >= _WEIGHT * max_changes(elements))
