@@ -21,7 +21,7 @@ from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.recursions import sweeps
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.system import System, symbols
+from jaxdyn.systems.system import System
 
 
 def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv"]:
@@ -354,17 +354,14 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     Source: Li & Wu, Property 2, corrected (EQUATIONS section 2, E8).
     """
     (q,) = check_shapes(model, q=q)
-    _check_coordinates(model, "mass_matrix_derivative")
+    joints = zip(model.topology.kinds, model.joint_names, strict=True)
+    other = [f"{joint!r} ({kind})" for kind, joint in joints if kind in ("planar", "spherical", "free")]
+    if other:
+        raise ValueError(
+            f"mass_matrix_derivative needs coordinates with v = dq/dt (nq = nv), but model {model.name!r} has joints"
+            f" {', '.join(other)} (nq = {model.nq}, nv = {model.nv}); use coriolis_matrix, which needs none"
+        )
     return _by_matrices(world_frame.mass_matrix_derivative, model, q)
-
-
-def first_kind_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
-    """Christoffel symbols of the first kind of the mass matrix, (nv, nv, nv); see `jd.geometry.christoffel_symbols`."""
-    if isinstance(model, System):
-        return system_quantity("christoffel_symbols", model, *check_state(model, q=q, t=t))
-    (q,) = check_shapes(model, q=q)
-    _check_coordinates(model, "christoffel_symbols")
-    return symbols(mass_matrix_derivative(model, q))
 
 
 @kernel(static=1)
@@ -372,13 +369,3 @@ def system_quantity(name: str, system: System, *args):
     """Quantity of a system by the name of its method."""
     # The method is chosen by a static name, so that each quantity is one cached program.
     return getattr(system, name)(*args)
-
-
-def _check_coordinates(model: Model, name: str) -> None:
-    joints = zip(model.topology.kinds, model.joint_names, strict=True)
-    other = [f"{joint!r} ({kind})" for kind, joint in joints if kind in ("planar", "spherical", "free")]
-    if other:
-        raise ValueError(
-            f"{name}: symbols need coordinates with v = dq/dt (nq = nv), but model {model.name!r} has joints"
-            f" {', '.join(other)} (nq = {model.nq}, nv = {model.nv}); use coriolis_matrix, which needs none"
-        )

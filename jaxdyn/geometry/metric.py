@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
-from jaxdyn.dynamics.quantities import first_kind_symbols, mass_matrix
+from jaxdyn.dynamics.quantities import mass_matrix, mass_matrix_derivative, system_quantity
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, as_float, batch_hint, check_state, check_system, state_dtype
@@ -104,8 +104,10 @@ def christoffel_symbols(
 @_compile_for_systems
 def _symbols(metric, q, t, kind):
     g = _as_function(metric, t)
-    is_system = isinstance(metric, (Model, System))
-    first = first_kind_symbols(metric, q, t) if is_system else symbols(jax.jacfwd(g)(q))
+    if isinstance(metric, System):
+        first = system_quantity("christoffel_symbols", metric, q, t)
+    else:
+        first = symbols(mass_matrix_derivative(metric, q) if isinstance(metric, Model) else jax.jacfwd(g)(q))
     # One factorisation of g for all n^2 columns.
     return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
 
