@@ -247,11 +247,12 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
     is_lost = ~mode.stick & rough & (reaction.pivots <= 0)
     pulls = opens & mode.closed & ((reaction.normal < -tiny) | is_lost) & ~held
     cone = problem.static * jnp.abs(reaction.normal)
+    sticks = mode.stick & rough
     wrong = [
-        pulls & ~mode.stick,
+        pulls & ~sticks,
         problem.may_close & ~mode.closed & (normal < -rise),
         # A contact that sticks and would pull slides first: then it may well push.
-        mode.closed & mode.stick & rough & ((hold > cone + tiny) | pulls) & ~problem.stopped,
+        mode.closed & sticks & ((hold > cone + tiny) | pulls) & ~problem.stopped,
         mode.closed & ~mode.stick & rough & problem.may_stick & backwards,
         ~opens & has_multiplier & (reaction.normal < -tiny),
     ]
