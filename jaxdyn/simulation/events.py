@@ -295,22 +295,20 @@ def first_violation(
     rows: Float[Array, "nt k"],
     reached: Bool[Array, " nt"],
     ts: Float[Array, " nt"],
-    within: tuple[Bool[Array, ""], Float[Array, ""], Float[Array, " k"]] | None,
+    time: Float[Array, ""],
+    entry: Int[Array, ""] | None,
 ) -> Violation:
     """First negative allowance, from those at the save points and at the event that ended a step.
 
-    `within` is None, or whether there was such an event, its time and the allowances (k,) there.
+    `time` and `entry` are those of such an event, -1 for none; None where no loop looks for one.
     """
     below = reached & (rows < 0).any(1)
     # The first true flag; zero without any, where `happened` is false.
     first = jnp.argmax(below)
     violation = Violation(below.any(), ts[first], jnp.argmin(rows[first]).astype(jnp.int32))
-    if within is not None:
-        happened, time, margins = within
-        # A singular basis may have ended the step too: then no margin is near zero.
-        happened = happened & (jnp.min(margins) <= jnp.finfo(rows.dtype).eps ** 0.25 * (1 + jnp.max(jnp.abs(margins))))
-        located = Violation(happened, time, jnp.argmin(margins).astype(jnp.int32))
-        earlier = happened & ~(violation.happened & (violation.time <= time))
+    if entry is not None:
+        located = Violation(entry >= 0, time, entry.astype(jnp.int32))
+        earlier = located.happened & ~(violation.happened & (violation.time <= time))
         violation = jax.tree.map(lambda a, b: jnp.where(earlier, a, b), located, violation)
     return violation._replace(entry=jnp.where(violation.happened, violation.entry, -1))
 

@@ -37,7 +37,7 @@ from jaxdyn.simulation.solvers.choice import (
     progress_meter,
     solver_and_control,
 )
-from jaxdyn.simulation.solvers.diffrax_loop import DiffraxRun, GuardedSolver, event_of, run, run_adaptively
+from jaxdyn.simulation.solvers.diffrax_loop import DiffraxRun, GuardedSolver, event_of, run, run_adaptively, sizes_of
 from jaxdyn.simulation.solvers.driver import COUNTS, ROOM, LibraryRun, step_control
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS, delay
 from jaxdyn.simulation.solvers.steps import Plan
@@ -80,7 +80,7 @@ def smooth_motion(given_scene: Scene | Known, control, method: Method, numbers, 
     run, y0 = _set_up(scene, control, method, inputs, options)
     ts, good = inputs.ts, inputs.good
     solver, term, corrector = _solver(run, y0, options.solver)
-    rows, result, counts, time_reached, last = integrate(
+    rows, result, counts, time_reached, guard = integrate(
         term, corrector, run.eqs, run.args, method, y0, ts, inputs.steps, options._replace(solver=solver)
     )
     y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, rows)
@@ -92,7 +92,7 @@ def smooth_motion(given_scene: Scene | Known, control, method: Method, numbers, 
     work = y.pop("work", None)
     # By the kernels that have put the start on the constraints.
     q, v = map_rows(lambda row: run.to_qv(*row), (y, ts))
-    violation, ends = _violation(run, (y, q, v, ts), reached, result, time_reached, last), []
+    violation, ends = _violation(run, (y, q, v, ts), reached, time_reached, guard), []
     if violation is not None:
         # A save point at the time of the violation still belongs to the motion.
         reached = reached & ~(violation.happened & (ts > violation.time))
@@ -214,17 +214,12 @@ def _solver(run: _Run, y0, solver):
     return solver, term, eqs.project if corrects or controls.HELD in y0 or KEPT in y0 else None
 
 
-def _violation(run: _Run, rows, reached, result, time_reached, last) -> Violation | None:
-    """First violation of a condition that ends the run; `last`, the state at the event of a step or None."""
+def _violation(run: _Run, rows, reached, time_reached, guard) -> Violation | None:
+    """First violation of a condition that ends the run; `guard`, the one at whose root a step has ended, as of `Outcome`."""
     if not any(run.eqs.conditions):
         return None
-    margins, within = map_rows(lambda row: run.eqs.allowances(run.args, *row), rows), None
-    if last is not None:
-        # The event has located the zero within a step, between two save points.
-        q, v = run.method.to_qv(run.scene, last, time_reached)
-        there = run.eqs.allowances(run.args, last, q, v, time_reached)
-        within = (result == RESULTS.event_occurred, time_reached, there)
-    return first_violation(margins, reached, rows[-1], within)
+    margins = map_rows(lambda row: run.eqs.allowances(run.args, *row), rows)
+    return first_violation(margins, reached, rows[-1], time_reached, guard)
 
 
 def _faults_of_start(run: _Run, y0, inputs: Inputs, options) -> list[tuple[Array, Any]]:
@@ -280,13 +275,13 @@ def _redundancy(run: _Run, y, q, ts, reached) -> dict[str, Array]:
 
 
 class Outcome(NamedTuple):
-    """Rows of the state at ts[1:], a code, counts, the time reached, and the state there if an event may end the run."""
+    """Rows of the state at ts[1:], a code, counts, the time reached, and the guard that is zero there, -1 for none."""
 
     rows: Any
     result: Any
     counts: dict[str, Any]
     time_reached: Any
-    last: Any = None
+    guard: Any = None
 
 
 def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, options: Options) -> Outcome:
@@ -315,8 +310,8 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
         event = event_of(quality, guards, ts[0], y0, args)
         meter = progress_meter(options.progress)
         given = DiffraxRun(term, solver, controller, event, adjoint, options.max_steps, meter, dt0)
-        outcome = _by_diffrax(given, inputs, steps, options)
-        return outcome._replace(rows=_without_mark(outcome.rows), last=_without_mark(outcome.last))
+        outcome = _by_diffrax(given, inputs, steps, options, guards)
+        return outcome if guards is None else outcome._replace(rows={x: outcome.rows[x] for x in y0 if x != WITHIN})
     if loop == "pieces":
         return _by_pieces(solver.plan(y0), eqs, inputs, controller, steps, options)
     plan = solver.plan(y0)._replace(quality=quality, guards=guards)
@@ -332,11 +327,6 @@ def _monitors(eqs: Equations, method) -> tuple[Callable | None, Callable | None]
         return jnp.where(is_regular(value), value, jnp.zeros_like(value))
 
     return quality if isinstance(method, Reduced) else None, eqs.guards if any(eqs.conditions) else None
-
-
-def _without_mark(y):
-    """State without the mark of `GuardedSolver`."""
-    return y and {name: y[name] for name in y if name != WITHIN}
 
 
 def undifferentiable(tree, reason: str):
@@ -362,12 +352,24 @@ def _is_direct(adjoint) -> bool:
     return isinstance(adjoint, (diffrax.ForwardMode, diffrax.DirectAdjoint))
 
 
-def _by_diffrax(given: DiffraxRun, inputs, steps, options: Options) -> Outcome:
+def _by_diffrax(given: DiffraxRun, inputs, steps, options: Options, guards) -> Outcome:
     """Integrate in diffrax's loop."""
-    ts = inputs[2]
+    y0, args, ts = inputs
+
+    def guard_at(result, time, last):
+        relative = guards(time, last, args)[0] / sizes_of(guards, ts[0], y0, args)
+        # A singular basis may have ended the step too: then no guard is near zero.
+        happened = (result == RESULTS.event_occurred) & (jnp.min(relative) <= jnp.finfo(ts.dtype).eps ** 0.25)
+        return jnp.where(happened, jnp.argmin(relative), -1)
+
+    def outcome(rows, result, counts, reached, *last):
+        return Outcome(
+            rows, result, counts, reached, *(guard_at(result, reached, y) for y in last if guards is not None)
+        )
+
     if not is_step_length(steps[-1]):
         rows, (result, *facts) = run_adaptively(inputs, given, options.limit_is_given)
-        return Outcome(rows, from_diffrax(result), *facts)
+        return outcome(rows, from_diffrax(result), *facts)
     rows, (result, counts, reached, *last), solution = run(inputs, given)
     sums = solution.controller_state[3:] if isinstance(given.controller, ErrorMonitoredSteps) else None
     # diffrax is at the end of the step that could not be solved; what is known ends at its beginning.
@@ -376,7 +378,7 @@ def _by_diffrax(given: DiffraxRun, inputs, steps, options: Options) -> Outcome:
     reached = jnp.where(result == RESULTS.nonlinear_divergence, before, reached)
     if sums is not None:
         result = RESULTS.where((result == RESULTS.successful) & too_coarse(sums), RESULTS.coarse_steps, result)
-    return Outcome(rows, result, counts, reached, *last)
+    return outcome(rows, result, counts, reached, *last)
 
 
 def _by_pieces(plan: Plan, eqs: Equations, inputs, controller, steps, options: Options) -> Outcome:
@@ -409,10 +411,14 @@ def _by_steps(solver: LibrarySteps, plan: Plan, controller, inputs, steps, optio
         run = LibraryRun(plan, control, controller.rtol, controller.atol, None, maximum, room=room)
     else:
         run = LibraryRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], maximum, room=maximum)
-    rows, (result, counts, reached) = (run.direct if _is_direct(options.adjoint) else run)(*inputs)
+    rows, (result, counts, reached, hit) = (run.direct if _is_direct(options.adjoint) else run)(*inputs)
     if plan.guards is None:
         return Outcome(rows, result, counts, reached)
     rows, end = (jax.tree.map(lambda x, at=at: x[at], rows) for at in (slice(-1), -1))
-    args, y = inputs[1], ravel_pytree(end)[0]
-    late = delay(lambda args, t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of, args, reached, y)
-    return Outcome(rows, result, counts, reached + jnp.where(result == RESULTS.event_occurred, late, 0.0), end)
+    y, first = ravel_pytree(end)[0], jnp.argmax(hit)
+
+    def guard(known, t, y):
+        return plan.guards_of(known[0], t, y)[0][known[1]]
+
+    late = delay(guard, lambda known, t, y: plan.field_of(known[0], t, y), (inputs[1], first), reached, y)
+    return Outcome(rows, result, counts, reached + jnp.where(hit.any(), late, 0.0), jnp.where(hit.any(), first, -1))

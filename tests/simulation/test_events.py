@@ -226,7 +226,7 @@ def test_contact_lets_go_where_it_would_pull():
 
 
 def test_stops_without_friction_hit_and_let_go_by_newtons_law():
-    """A bar on two stops with any velocity at the start: impulses push, and a rebound below -e u has none. A throw is among them."""
+    """A bar on two stops, with any velocity at the start, as in a throw: impulses push, and what rebounds faster has none."""
     builder = jd.ModelBuilder("bar", gravity=(0.0, 0.0, -G))
     builder.add_body("lift", None, "prismatic", (0.0, (0, 0, 0), (0, 0, 0)), axis=(0, 0, 1))
     builder.add_body("bar", "lift", "revolute", (2.0, (0.1, 0, 0), (0.3, 0.3, 0.3)), axis=(0, 1, 0))

@@ -1,5 +1,6 @@
 """Position limits of joints in a motion: told, or the end of the run, at the time of the closed form."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -111,6 +112,30 @@ def test_a_terminal_event_ends_a_run_at_its_time():
 
 
 OTHER_STEPS = {"adaptive": {}, "fixed": {"stepsize": 0.01}, "stiff": {"solver": jd.solvers.Rodas5P()}}
+
+
+def scaled(level, q, v, t):
+    return 1e13 * (height(q) - level)
+
+
+@pytest.mark.parametrize("how", [*OTHER_STEPS, pytest.param("implicit", marks=pytest.mark.slow)])
+def test_terminal_events_have_units_of_their_own(how):
+    """The rounding of an event in large units is more than the whole value of another; index, code and derivative are its own."""
+    options = (OTHER_STEPS | {"implicit": {"solver": diffrax.Kvaerno5()}})[how]
+
+    def end(level):
+        events = lambda q, v, t: 0.01 - 0.001 * t, jax.tree_util.Partial(scaled, level)
+        run = fall(-9.0, *events, throw=False, **options)
+        return run.stats["time_reached"], run
+
+    levels = jnp.linspace(0.1, 1.9, 64)
+    (times, runs), slopes = jax.jit(jax.vmap(jax.value_and_grad(end, has_aux=True)))(levels)
+    expected = np.sqrt(2 * (2 - levels) / 9.81)
+    ended = expected < 1
+    assert (np.asarray(runs.result == jd.RESULTS.event_occurred) == ended).all()
+    np.testing.assert_array_equal(runs.stats["terminal_event"], np.where(ended, 1, -1))
+    np.testing.assert_allclose(times, np.where(ended, expected, 1.0), rtol=1e-9)
+    np.testing.assert_allclose(slopes, np.where(ended, -1 / (9.81 * expected), 0.0), rtol=1e-8)
 
 
 @pytest.mark.parametrize(("how", "function"), [("adaptive", jnp.sqrt), ("fixed", jnp.log), ("stiff", jnp.sqrt)])

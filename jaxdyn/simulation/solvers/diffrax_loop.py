@@ -307,9 +307,10 @@ def event_of(quality, guards, t0, y0, args) -> diffrax.Event | None:
         return None if quality is None else diffrax.Event(quality)
     start = None if quality is None else jax.lax.stop_gradient(quality(t0, y0, args))
 
-    def condition(start, t, y, args, **_):
+    def condition(known, t, y, args, **_):
+        start, sizes = known
         # One event for all conditions: the first one that is violated ends the run.
-        minimum = jnp.minimum(jnp.min(guards(t, y, args)[0]), y[WITHIN])
+        minimum = jnp.minimum(jnp.min(guards(t, y, args)[0] / sizes), y[WITHIN])
         if quality is not None:
             # A run has one event: a basis that has become singular counts as a violation, whatever the allowances.
             minimum = jnp.where(quality(t, y, args) * start > 0, minimum, -jnp.ones_like(minimum))
@@ -317,9 +318,16 @@ def event_of(quality, guards, t0, y0, args) -> diffrax.Event | None:
 
     eps = float(jnp.finfo(t0.dtype).eps)
     # A traced value must be a leaf of the event: reverse mode refuses one that a function captures.
+    known = start, sizes_of(guards, t0, y0, args)
     return diffrax.Event(
-        jax.tree_util.Partial(condition, start), Bisection(rtol=8 * eps, atol=8 * eps, flip=True), direction=False
+        jax.tree_util.Partial(condition, known), Bisection(rtol=8 * eps, atol=8 * eps, flip=True), direction=False
     )
+
+
+def sizes_of(guards, t0, y0, args):
+    """Sizes (k,) of guards, each in its own units, from the start of a run."""
+    sizes = jnp.abs(jax.lax.stop_gradient(guards(t0, y0, args)[0]))
+    return jnp.where(sizes > 0, sizes, jnp.ones_like(sizes))
 
 
 class Bisection(optimistix.Bisection):

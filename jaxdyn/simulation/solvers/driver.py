@@ -378,7 +378,8 @@ def _(primals, tangents):
 
 
 class LibraryRun(Integrator):
-    """Integrator by explicit steps: call(y0, args, ts) -> rows of the state at ts[1:]; result, counts, and the time reached.
+    """Integrator by explicit steps: call(y0, args, ts) -> rows of the state at ts[1:]; result, counts, the time reached, and the
+    guards (k,) that are zero there.
 
     A plan with guards has a further row, that of the state at the time reached.
 
@@ -410,10 +411,10 @@ class LibraryRun(Integrator):
             history = reverse.History(states, times, kept, state.tried)
         elif is_one_step:
             history = reverse.of_one_step(start, ts[0], jnp.minimum(ts[0] + self.stepsize, ts[-1]))
-        stopped = state.stopped if state.search is None else state.stopped | state.search.hit.any()
-        cases = [(stopped, RESULTS.event_occurred), *cases_of(limits, control, state)]
+        hit = jnp.zeros((0,), bool) if state.search is None else state.search.hit
+        cases = [(state.stopped | hit.any(), RESULTS.event_occurred), *cases_of(limits, control, state)]
         rows = rows if plan.guards is None else jnp.concatenate([rows, state.y[None]])
-        facts = first_of(cases, RESULTS.successful), state.counts, state.t
+        facts = first_of(cases, RESULTS.successful), state.counts, state.t, hit
         return (jax.vmap(plan.structure)(rows), facts), history
 
     def replay(self, history, inputs, direct):
