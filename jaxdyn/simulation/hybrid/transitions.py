@@ -234,8 +234,10 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
     # Friction mu N against a slip d is the projection of mu N d + r u, u the rate of slipping, onto its disk, for any r > 0:
     # inside of the disk it sticks, and outside it has the direction of this vector.
     level = jnp.maximum(problem.sliding * reaction.normal, 0.0)
-    square = rates_of(elements, problem.gram.squares)[1]
+    along_normal, square = rates_of(elements, problem.gram.squares)
     share = jnp.sum(square, 1)
+    # Where the tangent rows vanish friction holds nothing, and a moment later what sticks would hold the motion that turns them.
+    is_loose = (share <= float(jnp.finfo(dtype).eps) * along_normal) & (length(slipping)[0] > small)
     share = jnp.where(share > 0, 1 / jnp.where(share > 0, share, jnp.ones_like(share)), 0.0)
     trial, turned = length(level[:, None] * slip + share[:, None] * slipping)
     slides = mode.closed & ~mode.stick & rough & problem.may_stick & (level > tiny)
@@ -252,7 +254,7 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
         pulls & ~sticks,
         problem.may_close & ~mode.closed & (normal < -rise),
         # A contact that sticks and would pull slides first: then it may well push.
-        mode.closed & sticks & ((hold > cone + tiny) | pulls) & ~problem.stopped,
+        mode.closed & sticks & ((hold > cone + tiny) | pulls | is_loose) & ~problem.stopped,
         mode.closed & ~mode.stick & rough & problem.may_stick & backwards,
         ~opens & has_multiplier & (reaction.normal < -tiny),
     ]
