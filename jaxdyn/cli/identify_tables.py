@@ -125,10 +125,13 @@ def _choice_text(choice: Choice, model: Model) -> str:
 
 
 def _widening_text(result: RobotFit, labels) -> list[str]:
-    """Lines on joints whose errors show that the model lacks something, and on the terms that these support."""
+    """Lines on joints whose errors recur with the motion, and on the terms that these support."""
     cells = [f"{label} {x:.2g}" for label, x in zip(labels, result.intervals.widening, strict=True) if x > 1]
-    line = f"The model lacks something that recurs in the errors; intervals are wider by the factors {', '.join(cells)}"
-    lines = [line] if cells else []
+    # Noise in the regressor lowers the parameters (errors in variables), which leaves errors like those of a wrong model.
+    lines = [
+        f"Errors recur with the motion; intervals are wider by the factors {', '.join(cells)}. The model lacks something, or "
+        "noise of the positions changes the fit: errors that are white at a lower --cutoff are such noise"
+    ] if cells else []  # fmt: skip
     if omitted := result.intervals.omitted:
         terms = ", ".join(f"{name} at {labels[joint]}" for name, joint in omitted)
         lines.append(

@@ -321,8 +321,9 @@ def missing_wrench(
     if not feet:
         return needed
     G = jnp.concatenate([one.jacobian(model, q) for one in feet])[:, base].T
-    # The small term determines internal forces, which the remainder does not.
-    Q = matmul(G.T, G) + 1e-6 * jnp.eye(G.shape[1], dtype=q.dtype)
+    # The small term determines internal forces, which the remainder does not. In float32 rounding of G^T G hides a smaller one.
+    small = max(1e-6, 100 * float(jnp.finfo(q.dtype).eps))
+    Q = matmul(G.T, G) + small * jnp.eye(G.shape[1], dtype=q.dtype)
     # Without preload, which would count as a missing wrench where the feet carry little.
     bounds = cone_bounds([one.cone for one in feet], jnp.zeros((), q.dtype), q.dtype)
     optimum = solve_qp(Q, -matmul(G.T, needed), **bounds)

@@ -187,10 +187,10 @@ class Iterate(NamedTuple):
 class Method(abc.ABC):
     """A minimisation method. Its state passes through `init` and `step`, and never through `self`.
 
-    `floor`: a loss that rounding cannot lower, at which a fit has converged.
+    `floor`: a loss that rounding cannot lower, at which a fit has converged; logarithms have none.
     """
 
-    floor: float = 0.0
+    floor: float = -np.inf
 
     @abc.abstractmethod
     def init(self, start: Any, kept: dict[str, np.ndarray] | None) -> Iterate:

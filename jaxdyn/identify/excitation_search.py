@@ -200,6 +200,9 @@ def exciting_motion(
     before, after = (np.asarray(_rows(m, task, places), np.float64) for m in (motion, excitation))
     scale = np.asarray(task.scale, np.float64)
     ratio = [np.linalg.slogdet((W / scale).T @ (W / scale))[1] for W in (before, after)]
+    # Smaller amplitudes within all limits may undo what a short search has gained beyond them.
+    if ratio[1] < ratio[0] if objective == "logdet" else _condition(after) > _condition(before):
+        excitation, after, ratio[1] = motion, before, ratio[0]
     used = {name: share for name, share in _limit_shares(excitation, task).items() if name != "closure"}
     change = float(ratio[1] - ratio[0])
     return Excitation(excitation, robot, _condition(after), _condition(before), change, history, used, result)

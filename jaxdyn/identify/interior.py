@@ -254,8 +254,6 @@ class InteriorPoint(Method):
     A point is (origin, terms); the state of an iterate are bodies, terms and multipliers, and the two targets of the barrier.
     """
 
-    floor = -np.inf  # the divergence makes losses below zero possible
-
     def __init__(self, problem: TorqueProblem, tolerance: float):
         self.problem, self.linear = problem, problem.chart
         self.tolerance = tolerance

@@ -225,6 +225,8 @@ class LeastSquaresSteps(Method):
     It ends where a step changes unknowns and loss by less than `tolerance` of them. The state of an iterate is the solver's.
     """
 
+    floor = 0.0
+
     def __init__(self, errors: Callable, args, name: str, tolerance: float):
         kind = optx.LevenbergMarquardt if name == SOLVERS[0] else optx.Dogleg
         # A tolerance below rounding of float64 may never be met.
@@ -266,15 +268,23 @@ class GradientSteps(Method):
     **Arguments:** `loss`, a function defined once (it is static: another one compiles again), its arrays in `args`; `method`:
     "lbfgs" with a line search for the strong Wolfe conditions, "adam", whose `learning_rate` decays to zero along a cosine in
     `steps`, or an optax.GradientTransformation; `tolerance`: "lbfgs" ends once ten steps have lowered the loss by less than this
-    share of it.
+    share of it; `floor` of the loss: of squares zero.
 
     The state of an iterate is `_Descent`.
     """
 
     def __init__(
-        self, loss: Callable, args, *, method: Any, steps: int = 0, learning_rate: float = 0.0, tolerance: float = 0.0
+        self,
+        loss: Callable,
+        args,
+        *,
+        method: Any,
+        steps: int = 0,
+        learning_rate: float = 0.0,
+        tolerance: float = 0.0,
+        floor: float = -np.inf,
     ):
-        self.loss, self.args, self.tolerance = loss, args, tolerance
+        self.loss, self.args, self.tolerance, self.floor = loss, args, tolerance, floor
         self.is_searching = isinstance(method, str) and method == "lbfgs"
         self.optimizer = (
             _make_optimizer(method, int(steps), float(learning_rate)) if isinstance(method, str) else method
@@ -335,8 +345,6 @@ class RandomSteps(Method):
 
     **Arguments:** `losses`, from points, stacked leaf by leaf, to their losses (k,); `sizes`: pytree of the first deviations.
     """
-
-    floor = -np.inf
 
     def __init__(self, losses: Callable, sizes: Any, seed: int):
         self.losses, self.sizes, self.seed = losses, sizes, seed

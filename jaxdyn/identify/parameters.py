@@ -269,6 +269,7 @@ def _minimise(
         steps=watch.steps,
         learning_rate=solver.learning_rate,
         tolerance=solver.tolerance,
+        floor=0.0,
     )
     return descend(steps, unknowns, watch), None
 

@@ -328,9 +328,11 @@ def record(
     tau = np.zeros(v.shape) if tau is None else tau
     tau = as_array(tau, "tau", dtype)
     wanted = {"ts": (ts, ()), "q": (q, (scene.nq,)), "v": (v, (scene.nv,)), "tau": (tau, (scene.nv,))}
-    count = ts.shape[0] if ts.ndim else 0
+    if not (ts.ndim and len(ts)):
+        raise ValueError(f"ts has shape {ts.shape}; give the times (n,) of one sample or more")
+    count = len(ts)
     for name, (value, rest) in wanted.items():
-        if not count or value.shape != (count, *rest):
+        if value.shape != (count, *rest):
             raise ValueError(f"{name} has shape {value.shape}, expected {(count, *rest)}, one row per time in ts")
     # `jnp.interp` needs increasing times and does not test them.
     if is_concrete(ts) and not (np.diff(np.asarray(ts)) > 0).all():
@@ -377,7 +379,7 @@ def _interpolate_pose(values, at: int, ts, late) -> Float[Array, "n k"]:
     turns = values[:, at : at + 4]
     # A quaternion and its negative are one orientation: neighbours get the signs by which they are close.
     flips = jnp.where(jnp.sum(turns[1:] * turns[:-1], 1) < 0, -1.0, 1.0).astype(values.dtype)
-    turns = turns * jnp.cumprod(jnp.concatenate([jnp.ones_like(flips[:1]), flips]))[:, None]
+    turns = turns * jnp.cumprod(jnp.concatenate([jnp.ones(1, values.dtype), flips]))[:, None]
     if len(ts) > 1:
         i = jnp.clip(jnp.searchsorted(ts, lax.stop_gradient(late), side="right") - 1, 0, len(ts) - 2)
         share = jnp.clip((late - ts[i]) / (ts[i + 1] - ts[i]), 0.0, 1.0)

@@ -144,8 +144,8 @@ def make_step(
         residual, guess, lambda f, z: _newton(f, lambda z: jacobian(f, z), z, n), solve_linear, has_aux=True
     )
     xi = z[:n]
-    # Rounding of positions, of size q, is one of velocities, of size q/h.
-    size = jnp.max(jnp.abs(xi)) + jnp.max(jnp.abs(q)) / jnp.abs(h)
+    # Rounding of positions, of size q, is one of velocities, of size q/h; residuals of loops round where all angles are zero too.
+    size = jnp.max(jnp.abs(xi)) + jnp.max(jnp.abs(q), initial=1.0) / jnp.abs(h)
     solved = change <= float(jnp.finfo(q.dtype).eps) ** 0.75 * size
     end, last = displace(system, q, h * xi), balance(z)[1]
     velocity = _velocity(system, end, last, t1)

@@ -161,6 +161,8 @@ def test_keywords_of_exciting_motions():
     assert condition(found, identify.TERMS, 0.1) == pytest.approx(found.condition, rel=1e-6)
     other = identify.exciting_motion(model, terms=("viscous",), v_s=1.0, **few)
     assert condition(other, ("viscous",), 1.0) == pytest.approx(other.condition, rel=1e-6)
+    # Below zero, where a sum of squares would have ended, the logarithm goes on.
+    assert len(other.history) == 13 and other.history[-1] < 0 and other.logdet > 0
     third = identify.exciting_motion(model, v_s=1.0, **few)
     assert condition(third, identify.TERMS, 1.0) == pytest.approx(third.condition, rel=1e-6)
     still = identify.exciting_motion(model, learning_rate=0.0, **few)

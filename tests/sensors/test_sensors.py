@@ -239,6 +239,8 @@ def test_refusals():
         sensors.record(model, [sensors.Imu("tip")], [0.0, 0.0], jnp.zeros((2, 1)), jnp.zeros((2, 1)))
     with pytest.raises(ValueError, match=r"v has shape \(3, 1\), expected \(2, 1\)"):
         sensors.record(model, [sensors.Imu("tip")], [0.0, 1.0], jnp.zeros((2, 1)), np.zeros((3, 1)))
+    with pytest.raises(ValueError, match=r"ts has shape \(0,\); give the times \(n,\) of one sample or more"):
+        sensors.record(model, [sensors.Imu("tip")], np.zeros(0), jnp.zeros((0, 1)), np.zeros((0, 1)))
 
 
 PUSHED = """
@@ -344,6 +346,9 @@ def test_orientations_are_delayed_and_disturbed_on_the_group(mode):
         slope = jax.jacfwd(lambda delay: read(delay)["turn"][100])(jnp.asarray(delay))
         turned = rate * before[100] / 2
         assert_close(slope, -rate / 2 * np.array([-np.sin(turned), *(np.cos(turned) * axis)]), 1e-12)
+        # A single sample is the reading at all earlier times.
+        alone = sensors.record(ball, list_of, ts[:1], q[:1], v[:1])
+        assert_close(alone["turn"], truth[:1], 1e-12)
     else:
         with pytest.raises(ValueError, match=r"std of its Noise has 7 entries, its readings have 6 errors"):
             sensors.record(

@@ -183,6 +183,18 @@ def test_rows_that_depend_on_each_other(name):
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-12)
 
 
+def test_a_loop_whose_angles_are_zero():
+    """Short steps from rest where the zeros of the joints are: the rounding of a loop does not vanish with the angles."""
+    scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
+    homes = scene.system.home @ jax.vmap(jd.se3.exp)(jnp.zeros((3, 6)).at[:, 5].set(q))
+    shifted = jd.Scene(scene.system.replace(home=homes), scene.constraints)
+    step = quick(lambda scene, q, h: advance(scene, q, None, h, 0 * v))
+    for h in (1e-4, 2e-4, 5e-4):
+        expected, found = step(scene, q, jnp.asarray(h)), step(shifted, 0 * q, jnp.asarray(h))
+        assert found[-1]
+        np.testing.assert_allclose(found[0], expected[0] - q, atol=1e-14)
+
+
 class _Field(eqx.Module):
     stiffness: jax.Array
 
