@@ -897,8 +897,15 @@ def test_a_kernel_that_is_missing_is_said():
     assert_same(run(x), jnp.sin(x) * 2.345678)
 
 
-# --- files of machine code ---
+def test_kernels_of_one_slot_take_the_next_free_one():
+    """Numbers that are equal but for multiples of the size of the table, also at its end."""
+    table, size = (target.Entry * target.SLOTS)(), target.SLOTS
+    for number, slot in ((7, 7), (7 + size, 8), (2 * size - 1, size - 1), (size - 1, 0)):
+        target.free_entry(table, number).hash = number
+        assert table[slot].hash == number
 
+
+# --- files of machine code ---
 
 IR = "define double @f(double %x) {\n  %y = fmul double %x, CONSTANT\n  ret double %y\n}"
 
