@@ -518,7 +518,8 @@ def simulated_log(model, seed=0, noise=0.0):
 
 def fit_motion(model, log, shape="full", callback=None, solver=None, **options):
     """Inertias of a model by its motion."""
-    tree, objective = identify.Parameters(model).inertias(shape=shape), identify.Objective("trajectory", **options)
+    tree = identify.Parameters(model).inertias(shape=shape, metric=None)
+    objective = identify.Objective("trajectory", **options)
     solver = identify.Solver(tolerance=0.0) if solver is None else solver
     return identify.fit_parameters(model, log, tree, objective, solver, identify.Execution(callback=callback))
 
