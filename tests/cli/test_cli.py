@@ -5,11 +5,13 @@ import json
 import re
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pinocchio
 import pytest
+from motion_helpers import within
 
 import jaxdyn as jd
 from benchmarks.linkages import bennett
@@ -26,9 +28,8 @@ def arm(tmp_path_factory):
     builder = jd.ModelBuilder("arm")
     body = (2.0, (0, 0, 0.2), (0.02, 0.03, 0.02))
     builder.add_body("base", None, "fixed", body)
-    builder.add_body(
-        "upper", "base", "revolute", body, joint_name="shoulder", axis=(0, 1, 0), damping=0.3, friction=0.1
-    )
+    turn = {"axis": (0, 1, 0), "damping": 0.3, "friction": 0.1}
+    builder.add_body("upper", "base", "revolute", body, joint_name="shoulder", **turn)
     slide = {"axis": (0, 0, 1), "lower": -0.3, "upper": 0.3, "effort_limit": 50.0, "velocity_limit": 1.0}
     builder.add_body("slide", "upper", "prismatic", body, joint_name="lift", pose=(0, 0, 0.4), **slide)
     flat = (0.5, (0.1, 0, 0), (0.1, 0.001, 0.001))
@@ -130,14 +131,9 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, folder, run):
     assert [name.partition(" [")[0] for name in columns] == ["t", *names, "energy", "work"]
     log = jd.read_log("motion.csv", joint_names=model.joint_names)
     q0, v0 = np.array([0.5, 0.0, 0.0]), np.array([0.1, 0.0, -0.2])
-    motion = jd.simulate(
-        jd.Scene(model, forces=[jd.forces.JointDamping()]),
-        q0,
-        v0,
-        np.linspace(0, 0.2, 5),
-        control=lambda q, v, t: jd.gravity_force(model, q),
-        stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-10),
-    )
+    options = {"control": lambda q, v, t: jd.gravity_force(model, q), "stepsize": within(1e-10)}
+    scene = jd.Scene(model, forces=[jd.forces.JointDamping()])
+    motion = jd.simulate(scene, q0, v0, np.linspace(0, 0.2, 5), **options)
     # Both integrations have a tolerance of 1e-8 or less per step.
     np.testing.assert_allclose(log.q, motion.q, atol=1e-7)
     np.testing.assert_allclose(log.v, motion.v, atol=1e-7)
@@ -206,9 +202,8 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, run):
     place = 10 * fitted.nb + fitted.nv * jd.identify.TERMS.index("coulomb") + np.arange(7)
     rows[:, np.arange(7), place] = coulomb_through_filter(log, 0.01)
     # A URDF holds the inertia about the centre of mass, so some digits of small moments are lost on the way.
-    np.testing.assert_allclose(
-        jd.identify.torque_error(rows @ x, log.tau), report["torque_error"]["final_percent"], rtol=1e-6
-    )
+    error = jd.identify.torque_error(rows @ x, log.tau)
+    np.testing.assert_allclose(error, report["torque_error"]["final_percent"], rtol=1e-6)
     assert report["torque_error"]["final_percent"] < report["torque_error"]["test_percent"]
 
     # The same samples, filtered beforehand and so marked by their accelerations, give the same answer.
@@ -362,9 +357,8 @@ def test_identify_finds_delays(truth, folder, run):
     run(f"{command} --delay", *delays["seconds"])
     again = report_of("fit.json")
     assert again["delays"]["by"] == "given" and again["delays"]["std"] == [None] * 3
-    np.testing.assert_allclose(
-        again["test_logs"]["B.csv"]["percent"], report["test_logs"]["B.csv"]["percent"], rtol=1e-6
-    )
+    percents = [x["test_logs"]["B.csv"]["percent"] for x in (again, report)]
+    np.testing.assert_allclose(*percents, rtol=1e-6)
     for option, words in {
         "auto 0.1": "exclude other values",
         "late": "--delay: 'late'",
@@ -422,9 +416,7 @@ def test_identify_recovers_a_simulated_arm(arm, run):
     """Noise-free samples at 100 Hz, filtered beforehand: the true base parameters come back."""
     truth = jd.load_model(arm)
     simulate_logs(truth, "A")
-    inertias = np.array(truth.inertias)
-    inertias[:, :4] *= 1.2
-    jd.save_urdf(truth.replace(inertias=inertias), "wrong.urdf")
+    jd.save_urdf(truth.replace(inertias=truth.inertias.at[:, :4].multiply(1.2)), "wrong.urdf")
     run("identify --urdf wrong.urdf --log A.csv --method least-squares --report report.json")
     base = jd.identify.base_parameters(truth, jd.identify.TERMS)
     x = jd.identify.nominal_parameters(truth)
@@ -556,11 +548,9 @@ def test_export_writes_the_function(name, arm, folder, run):
 def test_export_names_what_a_function_of_the_tree_leaves_out(folder, run):
     inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     joint = '<joint name="{0}" type="continuous"><parent link="base"/><child link="{1}"/><axis xyz="0 0 1"/>{2}</joint>'
+    joints = joint.format("j", "a", '<dynamics damping="0.4"/>') + joint.format("k", "b", '<mimic joint="j"/>')
     (folder / "rotors.urdf").write_text(
-        f'<robot name="r"><link name="base"/><link name="a">{inertial}</link><link name="b">{inertial}</link>'
-        + joint.format("j", "a", '<dynamics damping="0.4"/>')
-        + joint.format("k", "b", '<mimic joint="j"/>')
-        + "</robot>"
+        f'<robot name="r"><link name="base"/><link name="a">{inertial}</link><link name="b">{inertial}</link>{joints}</robot>'
     )
     assert "without gear k-j, JointDamping; --function constrained_dynamics" in run("export rotors.urdf --out out")
     assert "without" not in run("export rotors.urdf --function constrained_dynamics --out out")
@@ -635,11 +625,8 @@ def test_simulate_a_file_with_a_loop(four_bar, folder, run):
     assert float(text.split("at most ")[1].split(" J")[0]) < 1e-7
     with pytest.warns(jd.io.NotTakenWarning):
         scene = jd.load(four_bar)
-    gaps = [
-        np.abs(scene.constraints[0].position(scene.system, jnp.asarray(q), 0.0)).max()
-        for q in arrays_of("motion.npz")["q"]
-    ]
-    assert max(gaps) < 1e-10
+    (loop,), qs = scene.constraints, jnp.asarray(arrays_of("motion.npz")["q"])
+    assert max(np.abs(loop.position(scene.system, q, 0.0)).max() for q in qs) < 1e-10
     with pytest.warns(jd.io.NotTakenWarning):
         assert "--start is 'home'; the named states are reference, open" in run(f"{command} --start home", status=2)
 
@@ -686,13 +673,9 @@ def test_calibrate(folder, run):
         builder = jd.ModelBuilder("arm").add_body("base", joint="fixed")
         limits = {"lower": -2.0, "upper": 2.0, "effort_limit": 9.0, "velocity_limit": 9.0}
         for i, axis in enumerate(((0, 0, 1), (0, 1, 0), (1, 0, 0))):
-            options = {
-                "axis": axis,
-                "pose": ((0.1 + stretch * i, 0.1, 0.3), (0.3, 0, 0)),
-                "joint_name": f"j{i}",
-            } | limits
-            parent, ball = f"l{i - 1}" if i else "base", jd.inertia.sphere(1.0, 0.5)
-            builder.add_body(f"l{i}", parent, inertia=ball, **options)
+            pose, parent = ((0.1 + stretch * i, 0.1, 0.3), (0.3, 0, 0)), f"l{i - 1}" if i else "base"
+            options = {"axis": axis, "pose": pose, "joint_name": f"j{i}", "inertia": jd.inertia.sphere(1.0, 0.5)}
+            builder.add_body(f"l{i}", parent, **options, **limits)
         jd.save_urdf(builder.build(), folder / name)
 
     write("nominal.urdf", 0.0)
@@ -702,13 +685,10 @@ def test_calibrate(folder, run):
     header, *rows = poses.read_text().splitlines()
     assert header == "j0,j1,j2" and len(rows) == 30
     q = np.array([[float(x) for x in row.split(",")] for row in rows])
-    places = np.stack([np.asarray(jd.frame_pose(true, jnp.asarray(x), "l2"))[:3, 3] for x in q])
+    places = jax.vmap(lambda q: jd.frame_pose(true, q, "l2")[:3, 3])(q)
     places = places + 1e-5 * np.random.default_rng(0).normal(size=places.shape)
-    lines = [
-        "j0,j1,j2,x,y,z",
-        *(",".join(map(repr, [*a, *b])) for a, b in zip(q.tolist(), places.tolist(), strict=True)),
-    ]
-    poses.write_text("\n".join(lines))
+    lines = [",".join(map(repr, row)) for row in np.concatenate([q, places], axis=1).tolist()]
+    poses.write_text("\n".join(["j0,j1,j2,x,y,z", *lines]))
     text = run(f"{command} --poses poses.csv --test 0.2 --out calibrated.urdf")
     # A marker on the frame of the last joint: its own turn moves it nowhere, so that fewer directions are found than any poses
     # of a marker beside it would determine.
@@ -716,13 +696,10 @@ def test_calibrate(folder, run):
     assert float(text.split("held out: ")[1].split(" mm")[0]) < 0.1
     fitted = jd.load_model("calibrated.urdf")
     assert fitted.joint_names == ("j0", "j1", "j2")
-    seen = np.stack(
-        [
-            np.linalg.inv(jd.frame_pose(fitted, jnp.asarray(x), "measuring_device"))
-            @ jd.frame_pose(fitted, jnp.asarray(x), "l2_measured")
-            for x in q
-        ]
+    device, marker = (
+        jax.vmap(lambda q, f=f: jd.frame_pose(fitted, q, f))(q) for f in ("measuring_device", "l2_measured")
     )
+    seen = np.linalg.inv(device) @ marker
     # The file alone gives the measured places, to five deviations of the noise, 0.01 mm.
     np.testing.assert_allclose(seen[:, :3, 3], places, atol=5e-5)
     assert "one of them" in run(f"{command} --choose 5 --poses poses.csv", status=2)

@@ -23,7 +23,7 @@ SHAPES = {
     "hull": (jd.contact.ConvexHull(POINTS), 'type="mesh" mesh="hull"'),
 }
 HEIGHTS = 0.05 * np.random.default_rng(1).random((8, 9))
-FIELD = jd.contact.HeightField(HEIGHTS, 0.3)
+FIELD, COARSE = (jd.contact.HeightField(HEIGHTS, 0.3, smooth=smooth) for smooth in (True, False))
 
 
 def poses(count, seed=2):
@@ -61,19 +61,6 @@ def extreme(shape, direction):
     return point(best.x)
 
 
-@pytest.mark.parametrize("name", SHAPES)
-def test_least_gaps_on_a_slope_are_distances(name):
-    """Against the extreme point of each shape; the point of contact is on the shape, and the normal that of the plane."""
-    shape = SHAPES[name][0]
-    contacts = jd.contact.shape_contacts("body", shape, friction=0.5)
-    R, p = poses(40)
-    points, normals, found, directions = gaps(contacts, R, p)
-    least = np.array([(R_ @ extreme(shape, -R_[2]) + p_)[2] for R_, p_ in zip(R, p, strict=True)])
-    np.testing.assert_allclose(found.min(1), least, atol=1e-10 if name != "ellipsoid" else 1e-9)  # of the minimiser
-    np.testing.assert_allclose(points[..., 2], found, atol=1e-15)
-    assert (normals == [0, 0, 1]).all() and (directions == np.eye(2, 3)).all()
-
-
 def mujoco_model(geom, ground):
     vertices = " ".join(f"{x:.17g}" for x in POINTS.ravel())
     return mujoco.MjModel.from_xml_string(
@@ -96,14 +83,21 @@ def mujoco_distance(m, R, p):
 
 
 @pytest.mark.parametrize("name", SHAPES)
-def test_gaps_on_a_plane_against_mujoco(name):
-    """The least one; meshes of MuJoCo have vertices in float32."""
+def test_least_gaps_on_a_plane_are_distances(name):
+    """Against the extreme point of each shape and MuJoCo; the point of contact is on the shape, the normal that of the plane."""
     shape, geom = SHAPES[name]
+    R, p = poses(80)
+    points, normals, found, directions = gaps(jd.contact.shape_contacts("body", shape, friction=0.5), R, p)
+    least = np.array([(R_ @ extreme(shape, -R_[2]) + p_)[2] for R_, p_ in zip(R[:40], p[:40], strict=True)])
+    np.testing.assert_allclose(
+        found[:40].min(1), least, atol=1e-10 if name != "ellipsoid" else 1e-9
+    )  # of the minimiser
+    np.testing.assert_allclose(points[..., 2], found, atol=1e-15)
+    assert (normals == [0, 0, 1]).all() and (directions == np.eye(2, 3)).all()
     m = mujoco_model(geom, 'type="plane" size="1 1 1"')
-    R, p = poses(40, 3)
-    theirs = [mujoco_distance(m, *one) for one in zip(R, p, strict=True)]
-    ours = gaps(jd.contact.shape_contacts("body", shape), R, p)[2].min(1)
-    np.testing.assert_allclose(ours, theirs, atol=1e-7 if name == "hull" else 1e-10)
+    theirs = [mujoco_distance(m, *one) for one in zip(R[40:], p[40:], strict=True)]
+    # Meshes of MuJoCo have vertices in float32.
+    np.testing.assert_allclose(found[40:].min(1), theirs, atol=1e-7 if name == "hull" else 1e-10)
 
 
 ROUND = {
@@ -119,9 +113,8 @@ def test_sphere_on_shapes_against_mujoco_and_minimisation(name):
     on, geom = ROUND[name]
     m = mujoco_model('type="sphere" size="0.1"', geom)
     R, p = poses(60, 4)
-    points, normals, ours, _ = (
-        x[:, 0] for x in gaps(jd.contact.shape_contacts("body", jd.contact.Sphere(0.1), on=on), R, p)
-    )
+    ball = jd.contact.shape_contacts("body", jd.contact.Sphere(0.1), on=on)
+    points, normals, ours, _ = (x[:, 0] for x in gaps(ball, R, p))
     theirs = np.array([mujoco_distance(m, *one) for one in zip(R, p, strict=True)])
     # MuJoCo has contacts of a sphere whose centre is in a box up to its radius alone, and another face when that is nearer.
     np.testing.assert_allclose(ours, theirs, atol=1e-10)
@@ -163,10 +156,8 @@ def test_height_field_is_a_natural_spline():
     def theirs(u, i=0, j=0):
         return CubicSpline(y, along(u[0], i), bc_type="natural")(u[1], j)
 
-    np.testing.assert_allclose(
-        jax.jit(jax.vmap(lambda u: FIELD.height(u)))(spots), [theirs(u) for u in spots], atol=1e-14
-    )
-    found = jax.jit(jax.vmap(lambda u: FIELD.expand(u)))(jnp.asarray(spots))
+    heights, found = jax.jit(jax.vmap(lambda u: (FIELD.height(u), FIELD.expand(u))))(jnp.asarray(spots))
+    np.testing.assert_allclose(heights, [theirs(u) for u in spots], atol=1e-14)
     for name, axes in {"first": [()], "second": [(0,), (1,)], "third": [(0, 0), (0, 1), (1, 1)]}.items():
         for more in axes:
             for k in range(2):
@@ -174,14 +165,16 @@ def test_height_field_is_a_natural_spline():
                 value = [theirs(u, index.count(0), index.count(1)) for u in spots]
                 np.testing.assert_allclose(getattr(found, name)[(slice(None), *index)], value, atol=1e-11)
     nodes = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
-    for field in (FIELD, jd.contact.HeightField(HEIGHTS, 0.3, smooth=False)):
-        np.testing.assert_allclose(
-            jax.jit(jax.vmap(lambda u, f=field: f.height(u)))(nodes), HEIGHTS.ravel(), atol=1e-14
-        )
-        beyond = jnp.array([5.0, y[3]])
-        height, slope = jax.jit(jax.value_and_grad(lambda u, f=field: f.height(u)))(beyond)
-        np.testing.assert_allclose(height, HEIGHTS[-1, 3], atol=1e-14)
-        assert slope[0] == 0.0 and np.isfinite(jax.jit(jax.hessian(lambda u, f=field: f.height(u)))(beyond)).all()
+    for field in (FIELD, COARSE):
+
+        @jax.jit
+        @jax.vmap
+        def expand(u, f=field):
+            return f.height(u), jax.grad(lambda u: f.height(u))(u), jax.hessian(lambda u: f.height(u))(u)
+
+        height, slope, bend = expand(np.concatenate([nodes, [[5.0, y[3]]]]))  # and beyond the edge
+        np.testing.assert_allclose(height, [*HEIGHTS.ravel(), HEIGHTS[-1, 3]], atol=1e-14)
+        assert slope[-1, 0] == 0.0 and np.isfinite(bend[-1]).all()
     linear = jd.contact.HeightField(HEIGHTS, (0.3, 0.3), origin=(x[0], y[0]), smooth=False)
     middle = jnp.array([x[2] + 0.1, y[4] + 0.2])
     a, b = HEIGHTS[2, 4:6] @ [1 / 3, 2 / 3], HEIGHTS[3, 4:6] @ [1 / 3, 2 / 3]
@@ -296,80 +289,42 @@ def test_derivatives_of_gaps_against_differences(name, ground):
             np.testing.assert_allclose(found[order + 1][2][which], difference[which], atol=1e-8, err_msg=f"{order + 1}")
 
 
-PLACES = [
-    ("upright cylinder", jd.contact.Cylinder(0.1, 0.3), jd.contact.Plane(), (0, 0, 0), (0, 0, 0.1)),
-    (
-        "cylinder at the end of its ramp",
-        jd.contact.Cylinder(0.1, 0.3),
-        jd.contact.Plane(),
-        (UPRIGHT, 0, 0),
-        (0, 0, 0.1),
+BALL, CAN = jd.contact.Sphere(0.1), jd.contact.Cylinder(0.1, 0.3)
+UNEVEN, NODES = (jd.contact.HeightField(heights, 1.0) for heights in (np.zeros((4, 4)), np.ones((3, 3))))
+# Positions, and turns where there are some.
+PLACES = {
+    "cylinder upright, and at the end of its ramp": (CAN, jd.contact.Plane(), (0, 0, 0.1), (0, 0, 0.1, UPRIGHT, 0, 0)),
+    "upright cylinder on uneven ground": (CAN, UNEVEN, (0, 0, 0.1)),
+    "sphere at a node of the grid, and on a corner": (BALL, NODES, (0, 0, 1.1), (1, 1, 1.0)),
+    "equal centres": (BALL, jd.contact.Sphere(0.2), (0, 0, 0)),
+    "on the axis of a capsule": (BALL, jd.contact.Capsule(0.2, 0.4), (0, 0, 0.1)),
+    "centre, face and corner of a box": (
+        BALL, jd.contact.Box((0.2, 0.3, 0.4)), (0, 0, 0), (0.05, 0.05, 0.2), (0.1, 0.15, 0.2)
     ),
-    (
-        "upright cylinder on uneven ground",
-        jd.contact.Cylinder(0.1, 0.3),
-        jd.contact.HeightField(np.zeros((4, 4)), 1.0),
-        (0, 0, 0),
-        (0, 0, 0.1),
-    ),
-    (
-        "sphere at a node of the grid",
-        jd.contact.Sphere(0.1),
-        jd.contact.HeightField(np.ones((3, 3)), 1.0),
-        (0, 0, 0),
-        (0, 0, 1.1),
-    ),
-    (
-        "sphere on a corner of the grid",
-        jd.contact.Sphere(0.1),
-        jd.contact.HeightField(np.ones((3, 3)), 1.0),
-        (0, 0, 0),
-        (1, 1, 1.0),
-    ),
-    ("equal centres", jd.contact.Sphere(0.1), jd.contact.Sphere(0.2), (0, 0, 0), (0, 0, 0)),
-    ("on the axis of a capsule", jd.contact.Sphere(0.1), jd.contact.Capsule(0.2, 0.4), (0, 0, 0), (0, 0, 0.1)),
-    ("centre of a box", jd.contact.Sphere(0.1), jd.contact.Box((0.2, 0.3, 0.4)), (0, 0, 0), (0, 0, 0)),
-    (
-        "centre on a face of a box",
-        jd.contact.Sphere(0.1),
-        jd.contact.Box((0.2, 0.3, 0.4)),
-        (0, 0, 0),
-        (0.05, 0.05, 0.2),
-    ),
-    (
-        "centre on a corner of a box",
-        jd.contact.Sphere(0.1),
-        jd.contact.Box((0.2, 0.3, 0.4)),
-        (0, 0, 0),
-        (0.1, 0.15, 0.2),
-    ),
-    ("sphere on the plane", jd.contact.Sphere(0.1), jd.contact.Plane(), (0, 0, 0), (0, 0, 0)),
-]
-RARE = "sphere at a node of the grid", "upright cylinder on uneven ground"
+    "sphere on the plane": (BALL, jd.contact.Plane(), (0, 0, 0)),
+}  # fmt: skip
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=pytest.mark.slow if case[0] in RARE else (), id=case[0]) for case in PLACES]
-)
+@pytest.mark.parametrize("case", [pytest.param(x, marks=[pytest.mark.slow] * ("uneven" in x)) for x in PLACES])
 def test_derivatives_are_finite_in_singular_places(case):
     """Gaps, normals and slip directions, with first and second derivatives; the gap of a box is exact on its faces."""
-    _, shape, on, turn, place = case
+    shape, on, *places = PLACES[case]
     contacts = jd.contact.shape_contacts("body", shape, on=on)
 
     def all_of(x):
         touch = [c.contact.touching(jd.so3.exp(x[3:]), x[:3]) for c in contacts]
         return jnp.concatenate([jnp.concatenate([t.gap[None], t.normal, t.directions.ravel()]) for t in touch])
 
-    x = jnp.array([*place, *turn], float)
-
     def twice(function):
         return lambda x: (function(x),) * 2
 
     by_rows = jax.jacrev(twice(all_of), has_aux=True)
     second = jax.jacfwd(twice(jax.jacfwd(all_of)), has_aux=True)
-    for derivative in (by_rows, second):
-        assert all(np.isfinite(x).all() for x in jax.jit(derivative)(x))
+    for derivative in map(jax.jit, (by_rows, second)):
+        for place in places:
+            x = jnp.zeros(6).at[: len(place)].set(jnp.array(place, float))
+            assert all(np.isfinite(y).all() for y in derivative(x)), place
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -389,7 +344,7 @@ def on_body(shape, **options):
     return jd.contact.shape_contacts("body", shape, **options)
 
 
-COARSE, SLENDER = jd.contact.HeightField(HEIGHTS, 0.3, smooth=False), jd.contact.Ellipsoid((1, 1, 2))
+SLENDER = jd.contact.Ellipsoid((1, 1, 2))
 test_what_does_not_fit_is_refused = refusals(
     (lambda: on_body(jd.contact.Box((1, 1, 1)), on=jd.contact.Sphere(1.0)), "exchange them"),
     (lambda: on_body(SLENDER, on=jd.contact.Box((1, 1, 1))), "only a Sphere"),
@@ -413,10 +368,9 @@ test_what_does_not_fit_is_refused = refusals(
 )
 
 
-def body_of(*contacts, moments=(0.004, 0.005, 0.006)):
-    """A free body of 1 kg with contacts."""
-    builder = jd.ModelBuilder("body")
-    builder.add_body("body", None, "free", (1.0, (0.0, 0.0, 0.0), moments))
+def body_of(*contacts, inertia=(1.0, (0.0, 0.0, 0.0), (0.004, 0.005, 0.006))):
+    """A free body with contacts."""
+    builder = jd.ModelBuilder("body").add_body("body", None, "free", inertia)
     return jd.Scene(builder.build(), forces=contacts)
 
 
@@ -472,15 +426,8 @@ def test_ball_thrown_at_a_moving_box_conserves_momentum():
     builder = jd.ModelBuilder("two", gravity=None)
     for name, mass in (("ball", 0.5), ("box", 2.0)):
         builder.add_body(name, None, "free", (mass, (0.0, 0.0, 0.0), (0.01 * mass,) * 3))
-    hit = jd.contact.shape_contacts(
-        "ball",
-        jd.contact.Sphere(0.1),
-        on=jd.contact.Box((0.4, 0.4, 0.4)),
-        surface_body="box",
-        friction=0.6,
-        restitution=0.5,
-    )
-    scene = jd.Scene(builder.build(), forces=hit)
+    options = {"on": jd.contact.Box((0.4, 0.4, 0.4)), "surface_body": "box", "friction": 0.6, "restitution": 0.5}
+    scene = jd.Scene(builder.build(), forces=jd.contact.shape_contacts("ball", BALL, **options))
     model = scene.system
     parts = {"ball": ((-0.6, 0.05, 0.1), (2.0, 0.3, 0.1, 1.0, 2.0, -1.0)), "box": ((0, 0, 0), (0, 0.1, 0, 0.2, 0, 0.1))}
     q, v = np.zeros(14), np.zeros(12)
@@ -502,11 +449,8 @@ def test_ball_thrown_at_a_moving_box_conserves_momentum():
     for count in (60, 120, 240):
         (qs, vs), report = steps(scene, (jnp.asarray(q), jnp.asarray(v)), count, 0.3 / count)
         assert np.asarray(report.success).all() and float(max(f[:, -1].max() for f in report.forces.values())) > 10
-        before, after = (
-            momentum(q, v),
-            np.array([momentum(*x) for x in zip(np.asarray(qs), np.asarray(vs), strict=True)]),
-        )
-        errors.append([np.abs((after - before)[:, part]).max() for part in (slice(3), slice(3, 6))])
+        changes = np.array([momentum(*x) for x in zip(np.asarray(qs), np.asarray(vs), strict=True)]) - momentum(q, v)
+        errors.append([np.abs(changes[:, part]).max() for part in (slice(3), slice(3, 6))])
     # Velocities are those of axes that turn in a step: both momenta hold to its square.
     errors = np.array(errors)
     assert (errors[0] < 1e-4).all() and (np.abs(errors[:-1] / errors[1:] - 4) < 0.2).all(), errors
@@ -518,13 +462,9 @@ def test_gradient_of_steps_on_uneven_ground():
 
     def last(speed, bump):
         field = jd.contact.HeightField(jnp.asarray(HEIGHTS).at[4, 4].add(bump), 0.3)
-        step = jd.stepper(
-            body_of(
-                *jd.contact.shape_contacts("body", jd.contact.Sphere(0.1), on=field, friction=0.5), moments=(0.004,) * 3
-            ),
-            0.005,
-        )
-        state = jnp.array([-0.1, 0.05, 0.135, 1.0, 0, 0, 0]), jnp.array([1.0, 0, 0, 0, 0, 0]).at[0].set(speed)
+        contacts = jd.contact.shape_contacts("body", BALL, on=field, friction=0.5)
+        step = jd.stepper(body_of(*contacts, inertia=jd.inertia.sphere(1.0, 0.1)), 0.005)
+        state = jnp.array([-0.1, 0.05, 0.135, 1.0, 0, 0, 0]), jnp.zeros(6).at[0].set(speed)
         state, _ = jax.lax.scan(lambda s, _: (step(s, jnp.zeros(6)), None), state, None, length=40)
         return state[0][0] + 0.3 * state[0][2]
 
@@ -541,7 +481,7 @@ def test_lowest_corners_are_those_of_all_in_order(name):
     shape = SHAPES[name][0]
     every, lowest = jd.contact.shape_contacts("b", shape), jd.contact.shape_contacts("b", shape, lowest=4)
     R, p = poses(50)
-    (point, _, gap, _), (some, _, least, _) = gaps(every, R, p), gaps(lowest, R, p)
+    point, gap, some, least = (part for x in (every, lowest) for part in gaps(x, R, p)[::2])
     order = np.argsort(gap, 1)[:, :4]
     np.testing.assert_allclose(least, np.take_along_axis(gap, order, 1), rtol=0, atol=1e-15)
     np.testing.assert_allclose(some, np.take_along_axis(point, order[:, :, None], 1), rtol=0, atol=1e-15)
@@ -555,21 +495,13 @@ def test_lowest_corners_are_those_of_all_in_order(name):
 
 def test_a_box_falls_on_its_lowest_corners_as_on_all():
     """Impacts on corners, edges and a face."""
-    builder = jd.ModelBuilder("box")
-    size = (0.3, 0.2, 0.1)
-    builder.add_body("box", None, "free", jd.inertia.box(2.0, size))
-    turned = np.array([0.9, 0.3, 0.2, 0.1])
-    q = jnp.array([0, 0, 0.3, *(turned / np.linalg.norm(turned))])
-    ends = []
-    for lowest in (None, 4):
-        contacts = jd.contact.shape_contacts("box", jd.contact.Box(size), friction=0.6, restitution=0.2, lowest=lowest)
-        scene = jd.Scene(builder.build(), forces=contacts)
-        step = jd.stepper(scene, dt=0.005)
-        state = q, jnp.array([0.5, 0.2, 0, 1.0, 2.0, 0.5])
-        ends.append(
-            jax.jit(lambda s, step=step: jax.lax.scan(lambda x, _: (step(x, jnp.zeros(6)), x), s, length=160)[1])(state)
-        )
-    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-10)
-    np.testing.assert_allclose(ends[1][0][-1, 2], 0.05, atol=1e-10)
+    size, turned = (0.3, 0.2, 0.1), np.array([0.9, 0.3, 0.2, 0.1])
+    state = jnp.array([0, 0, 0.3, *(turned / np.linalg.norm(turned))]), jnp.array([0.5, 0.2, 0, 1.0, 2.0, 0.5])
+    ends, box = [], on_body(jd.contact.Box(size), friction=0.6, restitution=0.2)
+    for contacts in (box, on_body(jd.contact.Box(size), friction=0.6, restitution=0.2, lowest=4)):
+        scene = body_of(*contacts, inertia=jd.inertia.box(2.0, size))
+        ends.append(steps(scene, state, 160)[0][0])
+    np.testing.assert_allclose(*ends, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(ends[1][-1, 2], 0.05, atol=1e-10)
     with pytest.raises(ValueError, match=r"lowest corner.*jd\.stepper"):
         jd.simulate(scene, *state, [0.0, 0.1])

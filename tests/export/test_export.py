@@ -1,6 +1,7 @@
 """Exported functions: C programs, CasADi's interface, other processors and calls from NumPy, against JAX's own evaluation."""
 
 import ctypes
+import json
 import os
 import shutil
 import subprocess
@@ -44,15 +45,18 @@ def compiler() -> str:
     return found
 
 
+def ran(folder, *command) -> str:
+    """What a program prints, which ends without an error."""
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
 def run_c(folder, name: str, compile_command: list[str] | None = None, runner: tuple[str, ...] = ()) -> str:
     """Build the test program that `save` wrote, run it, and return what it prints."""
     command = compile_command or [compiler(), "-Wall", "-Werror", "-O1"]
-    files = [f"{name}_test.c", f"{name}.o"]
-    done = subprocess.run([*command, *files, "-lm", "-o", "program"], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    ran = subprocess.run([*runner, "./program"], cwd=folder, capture_output=True, text=True)
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    return ran.stdout
+    ran(folder, *command, f"{name}_test.c", f"{name}.o", "-lm", "-o", "program")
+    return ran(folder, *runner, "./program")
 
 
 def status_of(exported, *arrays, batch: bool = True) -> int:
@@ -74,9 +78,7 @@ def test_calls_from_numpy_equal_the_library(arm, exported):
 @pytest.mark.long
 def test_jacobian_equals_that_of_plain_jax(arm, exported):
     with jd.compilation("plain"):
-        expected = jax.jacrev(lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), (0, 1, 2))(
-            *map(jnp.asarray, (X, V, TAU))
-        )
+        expected = jax.jacrev(lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), (0, 1, 2))(*STATE)
     for got, reference in zip(exported.jacobian(X, V, TAU), expected, strict=True):
         np.testing.assert_allclose(got, reference, rtol=1e-10, atol=1e-11 * np.abs(reference).max())
 
@@ -98,23 +100,18 @@ def test_header_compiles_as_cplusplus_and_build_file_builds(exported, tmp_path):
         (tmp_path / "use.cpp").write_text(
             '#include "arm_fd.h"\nint main() { double x[ARM_FD_SIZE_Q] = {}, a[ARM_FD_SIZE_OUT]; return arm_fd(x, x, x, a); }\n'
         )
-        done = subprocess.run(
-            ["c++", "use.cpp", "arm_fd.o", "-lm", "-o", "use"], cwd=tmp_path, capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        assert subprocess.run(["./use"], cwd=tmp_path).returncode == 0
+        ran(tmp_path, "c++", "use.cpp", "arm_fd.o", "-lm", "-o", "use")
+        ran(tmp_path, "./use")
     if shutil.which("cmake") is None:
         pytest.skip("no cmake on this machine")
-    for command in (["cmake", "-S", ".", "-B", "build"], ["cmake", "--build", "build"], ["./build/arm_fd_test"]):
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout + done.stderr
+    for command in ("cmake -S . -B build", "cmake --build build", "./build/arm_fd_test"):
+        ran(tmp_path, *command.split())
 
 
 def undefined_symbols(path) -> set[str]:
     if shutil.which("nm") is None:
         pytest.skip("no nm on this machine")
-    printed = subprocess.run(["nm", "-u", path], capture_output=True, text=True, check=True).stdout
-    return {line.split()[-1] for line in printed.splitlines()}
+    return {line.split()[-1] for line in ran(path.parent, "nm", "-u", path).splitlines()}
 
 
 def test_object_file_needs_nothing_but_libm(exported, tmp_path):
@@ -192,6 +189,13 @@ def test_constrained_dynamics_and_projections(tmp_path):
     np.testing.assert_allclose(projection @ projection, projection, atol=1e-12)
 
 
+def acceleration_of(scene):
+    def function(q, v, tau):
+        return jd.constrained_dynamics(scene, q, v, tau).acceleration
+
+    return function
+
+
 def crossing():
     """q0^2 = q1^2: two lines that cross at the origin, where the row vanishes."""
     return jd.Scene(jd.scenes.planar_arm().system, [jd.Holonomic(lambda q, t: jnp.stack([q[0] ** 2 - q[1] ** 2]))])
@@ -199,12 +203,8 @@ def crossing():
 
 @pytest.mark.long
 def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
-    scene = crossing()
-
-    def function(q, v, tau):
-        return jd.constrained_dynamics(scene, q, v, tau).acceleration
-
-    q = np.array([0.5, 0.5])
+    scene, q = crossing(), np.array([0.5, 0.5])
+    function = acceleration_of(scene)
     exported = jd.export(function, q, q * 0, q, name="crossing", batch=True, derivatives="jacobian")
     x, zero = jnp.asarray(q), jnp.zeros(2)
     np.testing.assert_allclose(exported(q, q * 0, q), function(x, zero, x), rtol=1e-12)
@@ -223,9 +223,7 @@ def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
 def test_rows_that_contradict_each_other_give_a_status(tmp_path):
     # At the origin the velocity asks for 2 v0^2 = 2 v1^2, which no acceleration changes.
     scene, q, v = crossing(), np.zeros(2), np.array([1.0, 0.3])
-    exported = jd.export(
-        lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration, q + 0.5, v * 0, q, name="crossing"
-    )
+    exported = jd.export(acceleration_of(scene), q + 0.5, v * 0, q, name="crossing")
     assert jd.constrained_dynamics(scene, *map(jnp.asarray, (q, v, q))).result == jd.RESULTS.contradictory_rows
     with pytest.raises(FloatingPointError, match="no regular solution"):
         exported(q, v, q)
@@ -250,11 +248,7 @@ def test_redundant_rows(tmp_path):
     """Bennett's linkage: seven degrees of freedom of its tree, more rows than that, one freedom left."""
     scene = jd.scenes.bennett()
     q, v = map(np.asarray, jd.scenes.bennett.start())
-    tau = np.linspace(1, 2, scene.nv)
-
-    def function(q, v, tau):
-        return jd.constrained_dynamics(scene, q, v, tau).acceleration
-
+    tau, function = np.linspace(1, 2, scene.nv), acceleration_of(scene)
     exported = jd.export(function, q, v, tau, name="bennett", derivatives="jacobian", batch=True)
     a = exported(q, v, tau)
     np.testing.assert_allclose(a, function(*map(jnp.asarray, (q, v, tau))), rtol=1e-11, atol=1e-12)
@@ -357,25 +351,17 @@ def test_a_step_of_an_arm_behind_drives(tmp_path):
     step = jd.stepper(scene, 0.004, substeps=2)
     q, v, tau = np.array([0.3, -0.2]), np.array([0.1, 0.4]), np.array([1.0, -0.5])
     z = np.linspace(-0.3, 0.9, 6)
-    exported = jd.export(
-        lambda q, v, z, tau: step((q, v, z), tau), q, v, z, tau, name="driven", derivatives=("jacobian",)
-    )
+
+    options = {"name": "driven", "derivatives": ("jacobian",)}
+    exported = jd.export(lambda q, v, z, tau: step((q, v, z), tau), q, v, z, tau, **options)
     for got, expected in zip(exported(q, v, z, tau), step((q, v, z), tau), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-13)
     with jd.compilation("plain"):
         wanted = jax.jacrev(lambda z: step((q, v, z), tau)[1])(jnp.asarray(z))
     np.testing.assert_allclose(exported.jacobian(q, v, z, tau)[1][2], wanted, rtol=1e-9, atol=1e-12)
-    motion = jd.simulate(
-        scene,
-        q,
-        v,
-        jnp.asarray([0.0, 0.1]),
-        control=lambda q, v, t: jnp.asarray(tau),
-        stepsize=0.002,
-        outputs=("drive_state",),
-    )
-    start = scene.drive_state(jnp.asarray(q), jnp.asarray(v))
-    state = (q, v, np.asarray(start))
+    options = {"control": lambda q, v, t: jnp.asarray(tau), "stepsize": 0.002, "outputs": ("drive_state",)}
+    motion = jd.simulate(scene, q, v, jnp.asarray([0.0, 0.1]), **options)
+    state = (q, v, np.asarray(scene.drive_state(jnp.asarray(q), jnp.asarray(v))))
     for _ in range(25):
         state = exported(*state, tau)
     for got, expected in zip(state, (motion.q, motion.v, motion.drive_state), strict=True):
@@ -391,9 +377,8 @@ def test_a_step_of_an_arm_behind_drives(tmp_path):
 def test_jacobians_by_columns_equal_those_that_are_written_out(arm, exported, monkeypatch, tmp_path):
     assert isinstance(exported.derivative.program, standalone.Directions)
     monkeypatch.setattr(standalone, "MAX_WRITTEN_OUT", 10**9)
-    written = jd.export(
-        lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), X, V, TAU, name="arm_fd", derivatives=("jacobian",)
-    )
+    options = {"name": "arm_fd", "derivatives": ("jacobian",)}
+    written = jd.export(lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), X, V, TAU, **options)
     for got, expected in zip(written.jacobian(X, V, TAU), exported.jacobian(X, V, TAU), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
     written.save(tmp_path)
@@ -427,6 +412,15 @@ def test_a_lagrangian_and_a_control_law():
 # --- CasADi ---
 
 
+def in_casadi(exported, folder):
+    """The function as a shared library that CasADi calls."""
+    casadi = pytest.importorskip("casadi")
+    exported.save(folder, abi="casadi")
+    name = exported.name
+    ran(folder, compiler(), "-shared", "-o", f"{name}.so", f"{name}.o", "-lm")
+    return casadi.external(name, str(folder / f"{name}.so"))
+
+
 @pytest.mark.parametrize("by_columns", [False, True], ids=["written out", "by columns"])
 def test_casadi_has_exact_sparse_derivatives(tmp_path, monkeypatch, by_columns):
     casadi = pytest.importorskip("casadi")
@@ -438,36 +432,26 @@ def test_casadi_has_exact_sparse_derivatives(tmp_path, monkeypatch, by_columns):
 
     x, y = np.array([0.3, 0.7]), np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     exported = jd.export(function, x, y, name="fn", derivatives=("jacobian",))
-    exported.save(tmp_path, abi="casadi")
-    subprocess.run([compiler(), "-shared", "-o", "fn.so", "fn.o", "-lm"], cwd=tmp_path, check=True)
-    external = casadi.external("fn", str(tmp_path / "fn.so"))
+    external = in_casadi(exported, tmp_path)
     first, second = external(x, y)
     np.testing.assert_allclose(first.full().ravel(), function(x, y)[0], rtol=1e-14)
     np.testing.assert_allclose(second.full(), 2 * y)
     a, b = casadi.MX.sym("a", 2), casadi.MX.sym("b", 2, 3)
     out = external(a, b)
-    slopes = casadi.Function(
-        "J", [a, b], [casadi.jacobian(out[0], a), casadi.jacobian(out[0], b), casadi.jacobian(out[1], b)]
-    )
-    by_a, by_b, scaling = slopes(x, y)
+    slopes = [casadi.jacobian(*pair) for pair in ((out[0], a), (out[0], b), (out[1], b))]
+    by_a, by_b, scaling = casadi.Function("J", [a, b], slopes)(x, y)
     assert by_a.sparsity().nnz() == 3 and by_b.sparsity().nnz() == 2 and scaling.sparsity().nnz() == 6
     by_x, by_y = (np.asarray(J) for J in jax.jacobian(lambda x, y: function(x, y)[0], (0, 1))(x, y))
     np.testing.assert_allclose(by_a.full(), by_x, rtol=1e-13, atol=1e-15)
     by_columns = by_y.transpose(0, 2, 1).reshape(3, 6)  # CasADi stacks the columns of a matrix
     np.testing.assert_allclose(by_b.full(), by_columns, rtol=1e-13, atol=1e-15)
     np.testing.assert_allclose(scaling.full(), 2 * np.eye(6))
-    done = subprocess.run([sys.executable, "fn_test.py"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    ran(tmp_path, sys.executable, "fn_test.py")
 
 
-def test_ipopt_holds_an_arm_with_exact_derivatives(arm, tmp_path):
+def test_ipopt_holds_an_arm_with_exact_derivatives(arm, exported, tmp_path):
     casadi = pytest.importorskip("casadi")
-    exported = jd.export(
-        lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), X, V, TAU, name="fd", derivatives=("jacobian",)
-    )
-    exported.save(tmp_path, abi="casadi")
-    subprocess.run([compiler(), "-shared", "-o", "fd.so", "fd.o", "-lm"], cwd=tmp_path, check=True)
-    external, tau = casadi.external("fd", str(tmp_path / "fd.so")), casadi.MX.sym("tau", 7)
+    external, tau = in_casadi(exported, tmp_path), casadi.MX.sym("tau", 7)
     problem = {"x": tau, "f": casadi.sumsqr(tau), "g": external(X, V, tau)}
     options = {"ipopt.print_level": 0, "print_time": 0, "ipopt.hessian_approximation": "limited-memory"}
     found = casadi.nlpsol("s", "ipopt", problem, options)(x0=np.zeros(7), lbg=0, ubg=0)
@@ -511,8 +495,7 @@ def test_wasm_runs_in_node(exported, tmp_path):
     if linker is None or node is None:
         pytest.skip("needs node and Debian's lld")
     exported.save(tmp_path, target="wasm32")
-    command = [linker, "--no-entry", "--export=arm_fd", "--allow-undefined", "arm_fd.o", "-o", "arm_fd.wasm"]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    ran(tmp_path, linker, "--no-entry", "--export=arm_fd", "--allow-undefined", "arm_fd.o", "-o", "arm_fd.wasm")
     (tmp_path / "run.js").write_text(
         """
         const bytes = require("fs").readFileSync("arm_fd.wasm");
@@ -524,11 +507,7 @@ def test_wasm_runs_in_node(exported, tmp_path):
         });
         """
     )
-    import json
-
-    given = json.dumps([*X, *V, *TAU])
-    printed = subprocess.run([node, "run.js", given], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    status, *values = json.loads(printed)
+    status, *values = json.loads(ran(tmp_path, node, "run.js", json.dumps([*X, *V, *TAU])))
     assert status == 0
     np.testing.assert_allclose(values, exported(X, V, TAU), rtol=1e-12, atol=1e-12)
 
@@ -552,6 +531,9 @@ def test_maxima_on_cortex_m(tmp_path):
 # --- refusals ---
 
 
+SEVEN = jax.ShapeDtypeStruct((7,), float)
+
+
 @pytest.mark.parametrize(
     ("function", "examples", "options", "message"),
     [
@@ -561,12 +543,7 @@ def test_maxima_on_cortex_m(tmp_path):
         (lambda x: x, (X + 1j,), {"name": "f"}, "examples: x has dtype complex128"),
         (lambda x: x > 0, (X,), {"name": "f"}, "function returns arrays of bool"),
         (lambda x: x, (X,), {"name": "f", "derivatives": ("hessian",)}, "derivatives has 'hessian'"),
-        (
-            lambda x: jax.pure_callback(np.sin, jax.ShapeDtypeStruct((7,), float), x),
-            (X,),
-            {"name": "f"},
-            "it has pure_callback",
-        ),
+        (lambda x: jax.pure_callback(np.sin, SEVEN, x), (X,), {"name": "f"}, "it has pure_callback"),
         (lambda x: x[x > 0], (X,), {"name": "f"}, "it has shapes, branches"),
         (lambda x: x if x[0] > 0 else -x, (X,), {"name": "f"}, "it has shapes, branches"),
         (lambda x: jax.lax.complex(x, x), (X,), {"name": "f"}, "array of complex128"),
@@ -639,13 +616,8 @@ def test_solutions_of_equations_and_what_to_write_in_place_of_other_factors():
 @pytest.mark.long
 def test_loops_stay_loops_in_exported_code(arm):
     """A `while_loop` of unknown length, and a scan of 300 steps with its Jacobian, against JAX."""
-    exported = jd.export(
-        lambda x: jax.lax.while_loop(
-            lambda c: c[0] * c[0] - c[1] > 1e-13, lambda c: ((c[0] + c[1] / c[0]) / 2, c[1]), (x, x)
-        ),
-        2.0,
-        name="root",
-    )
+    going, halve = lambda c: c[0] * c[0] - c[1] > 1e-13, lambda c: ((c[0] + c[1] / c[0]) / 2, c[1])
+    exported = jd.export(lambda x: jax.lax.while_loop(going, halve, (x, x)), 2.0, name="root")
     for x in (2.0, 9.0, 1e6):
         np.testing.assert_allclose(exported(x)[0], np.sqrt(x), rtol=1e-14)
     step = jd.stepper(arm, 0.001)

@@ -8,9 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import scipy.optimize
+from motion_helpers import within
 from pinocchio_bridge import to_pinocchio
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, filtfilt
+from two_links import planar_arm, sines
 
 import jaxdyn as jd
 from benchmarks.identify_paths import arm as arm_of_joints
@@ -24,7 +26,6 @@ from jaxdyn.identify.problem import errors_of, pose_problem
 from jaxdyn.identify.regression import condense_model
 from jaxdyn.identify.robot_logs import RobotLogs, scene_with_parameters
 
-PI = np.pi
 pseudo_inertias = jax.jit(jax.vmap(inertia.pseudo_inertia))
 
 
@@ -35,30 +36,9 @@ def iiwa():
     return model.replace(damping=jnp.full(7, 0.5), friction=0.2 + 0.1 * jnp.arange(7.0), armature=jnp.full(7, 0.05))
 
 
-def planar_arm(mass1=1.0, mass2=0.8, dtype=None):
-    """Two links about parallel horizontal axes, in the vertical plane."""
-    builder = jd.ModelBuilder("arm", dtype=dtype)
-    moments = np.array([0.1, 0.09, 0.02])
-    builder.add_body("a", axis=(0, 1, 0), inertia=(mass1, (0.02, 0.01, -0.5), mass1 * moments))
-    builder.add_body("b", "a", pose=(0, 0, -1), axis=(0, 1, 0), inertia=(mass2, (0.01, 0, -0.4), mass2 * moments))
-    return builder.build()
-
-
 @pytest.fixture(scope="module")
 def arm():
     return planar_arm()
-
-
-def motion(nv, n=300, seed=3):
-    """Sums of sines with their exact derivatives: an exciting motion without noise."""
-    generator = np.random.default_rng(seed)
-    t = np.linspace(0, 6, n)
-    amplitude, phase = generator.uniform(0.3, 1.0, (4, nv)), generator.uniform(0, 2 * PI, (4, nv))
-    w = np.arange(1, 5)[:, None] * 1.3
-    angle = w * t[:, None, None] + phase
-    q = np.sum(amplitude * np.sin(angle), 1)
-    v = np.sum(amplitude * w * np.cos(angle), 1)
-    return t, q, v, np.sum(-amplitude * w**2 * np.sin(angle), 1)
 
 
 def friction_torque(v, viscous, coulomb, offset, v_s=0.01):
@@ -67,7 +47,7 @@ def friction_torque(v, viscous, coulomb, offset, v_s=0.01):
 
 def pinocchio_log(model, seed=3, noise=0.0, offset=0.0):
     """A log whose torques Pinocchio computed; friction by its formula."""
-    t, q, v, a = motion(model.nv, seed=seed)
+    t, q, v, a = sines(model.nv, seed=seed)
     reference, bridge = to_pinocchio(model)
     data = reference.createData()
     # Rotor inertia is added here and not taken from Pinocchio's armature.
@@ -103,17 +83,15 @@ def test_base_parameters_of_the_iiwa(iiwa):
     assert base.names[0] == "iiwa_link_1.Izz"
     kept = ("mcx", "mcy", "Ixx", "Ixy", "Ixz", "Iyz", "Izz")
     assert base.names[1:] == tuple(f"iiwa_link_{i}.{k}" for i in range(2, 8) for k in kept)
-    assert set(base.unidentifiable) >= {
-        f"iiwa_link_1.{k}" for k in ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyz")
-    }
+    hidden = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyz")
+    assert set(base.unidentifiable) >= {f"iiwa_link_1.{k}" for k in hidden}
     assert base.expressions[0] == "iiwa_link_1.Izz + 1 iiwa_link_2.Iyy"
     # The second witness: Pinocchio's regressor has this rank, and does not see a change that keeps the combinations.
     reference, _ = to_pinocchio(iiwa)
     data = reference.createData()
     generator = np.random.default_rng(1)
-    rows = np.vstack(
-        [pin.computeJointTorqueRegressor(reference, data, *generator.normal(size=(3, 7))).copy() for _ in range(60)]
-    )
+    states = generator.normal(size=(60, 3, 7))
+    rows = np.vstack([pin.computeJointTorqueRegressor(reference, data, *x).copy() for x in states])
     assert np.linalg.matrix_rank(rows, tol=1e-9) == 43
     null = np.linalg.svd(base.matrix)[2][43:]
     assert np.abs(rows @ null.T).max() < 1e-10 * np.abs(rows).max() * np.sqrt(70)
@@ -124,12 +102,10 @@ def test_base_parameters_of_two_links_in_closed_form(arm):
     """Moving the second link's mass into the first: Iyy1 + m2 l^2, mcz1 - m2 l; the plane hides the rest."""
     base = identify.base_parameters(arm)
     assert base.names == ("a.mcx", "a.mcz", "a.Iyy", "b.mcx", "b.mcz", "b.Iyy")
-    np.testing.assert_allclose(
-        base.values(arm.inertias), base.values(np.asarray(arm.inertias))
-    )  # takes (nb, 10) as well as (10 nb,)
     x = np.asarray(arm.inertias)
     expected = [x[0, 1], x[0, 3] - x[1, 0], x[0, 6] + x[1, 0], x[1, 1], x[1, 3], x[1, 6]]
-    np.testing.assert_allclose(base.values(x), expected, rtol=1e-12)
+    for given in (arm.inertias, x, x.reshape(-1)):  # takes (nb, 10) as well as (10 nb,)
+        np.testing.assert_allclose(base.values(given), expected, rtol=1e-12)
     with_rotors = identify.base_parameters(arm, ("armature", "viscous"))
     # The first rotor turns with the first link, the second only relative to it.
     assert len(with_rotors) == 6 + 1 + 2
@@ -147,10 +123,15 @@ def test_free_body_shows_all_ten():
 # --- linear least squares ---------------------------------------------------------------------------------------------
 
 
-def test_least_squares_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, iiwa_log):
-    fit = identify.least_squares(wrong_iiwa, iiwa_log)
+def with_offsets(iiwa):
+    """Parameters of the iiwa's log."""
     true = identify.nominal_parameters(iiwa)
     true[identify.parameter_names(iiwa).index("iiwa_joint_1.offset") :][:7] = 0.3
+    return true
+
+
+def test_least_squares_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, iiwa_log):
+    fit, true = identify.least_squares(wrong_iiwa, iiwa_log), with_offsets(iiwa)
     np.testing.assert_allclose(fit.values, fit.base.values(true), rtol=1e-8, atol=1e-8)
     assert fit.rank == len(fit.base) == 43 + 21 + 5  # two rotors turn with link inertias that are free themselves
     assert fit.error(iiwa_log) < 1e-8
@@ -195,7 +176,7 @@ def test_least_squares_counts_errors_that_last(iiwa, wrong_iiwa):
 
 def test_least_squares_says_what_the_log_does_not_show(arm):
     """A robot that is held at rest in many poses shows its first moments and no moment of inertia."""
-    t, q, v, _ = motion(2)
+    t, q, v, _ = sines(2)
     log = identify.Log(t, q, 0 * v, 0 * v, pinocchio_log(arm).tau)
     fit = identify.least_squares(arm, log, terms=())
     assert fit.rank == 4
@@ -205,36 +186,28 @@ def test_least_squares_says_what_the_log_does_not_show(arm):
 
 
 def test_bad_arguments_raise(arm, iiwa_log):
-    t, q, v, a = motion(2, n=20)
+    t, q, v, a = sines(2, n=20)
     log = identify.Log(t, q, v, a, q)
-    with pytest.raises(ValueError, match=r"terms is \('stiction',\)"):
-        identify.least_squares(arm, log, "stiction")
-    with pytest.raises(ValueError, match=r"v_s is 0\.0"):
-        identify.fit_torques(arm, log, v_s=0.0)
-    with pytest.raises(ValueError, match="7 columns of q, model 'arm' has 2"):
-        identify.least_squares(arm, iiwa_log)
-    with pytest.raises(ValueError, match="2 samples of 2 torques, too few for 6"):
-        identify.least_squares(arm, log[:2], terms=())
-    with pytest.raises(ValueError, match="leave no error to estimate"):
-        identify.fit_torques(arm, log[:2])
-    with pytest.raises(ValueError, match=r"weights is \[1.0, 0.0\]; give 2 positive"):
-        identify.fit_torques(arm, log, weights=[1, 0])
-    for name, value in (("inertia", "some"), ("prior", 0.0)):
-        with pytest.raises(ValueError, match=f"{name} is '?{value}"):
-            identify.fit_torques(arm, log, **{name: value})
-    with pytest.raises(ValueError, match="torques of the logs are all zero"):
-        identify.fit_torques(arm, identify.Log(t, q, v, a, 0 * q))
     rod = arm.replace(inertias=arm.inertias.at[1, 4:].set(0.0))
-    with pytest.raises(ValueError, match=r"inertia of b is not that of a solid body.*jd.model.repair_inertias"):
-        identify.fit_torques(rod, log)
-    with pytest.raises(ValueError, match=r"viscous of coordinate 1 is -0.5 in the model"):
-        identify.fit_torques(arm.replace(damping=jnp.array([0.0, -0.5])), log)
-    with pytest.raises(ValueError, match="the log has 1 sample"):
-        fit_motion(arm, log[:1])
-    with pytest.raises(ValueError, match="horizon=20 steps; a log of 20 samples allows 1 to 19"):
-        fit_motion(arm, log, horizon=20)
-    with pytest.raises(ValueError, match="the log has no v"):
-        fit_motion(arm, identify.Log(t, q, tau=q))
+    by_torque = identify.fit_torques
+    for words, call in (
+        (r"terms is \('stiction',\)", lambda: identify.least_squares(arm, log, "stiction")),
+        (r"v_s is 0\.0", lambda: by_torque(arm, log, v_s=0.0)),
+        ("7 columns of q, model 'arm' has 2", lambda: identify.least_squares(arm, iiwa_log)),
+        ("2 samples of 2 torques, too few for 6", lambda: identify.least_squares(arm, log[:2], terms=())),
+        ("leave no error to estimate", lambda: by_torque(arm, log[:2])),
+        (r"weights is \[1.0, 0.0\]; give 2", lambda: by_torque(arm, log, weights=[1, 0])),
+        ("inertia is 'some", lambda: by_torque(arm, log, inertia="some")),
+        ("prior is 0.0", lambda: by_torque(arm, log, prior=0.0)),
+        ("are all zero", lambda: by_torque(arm, identify.Log(t, q, v, a, 0 * q))),
+        ("inertia of b is not .*jd.model.repair_inertias", lambda: by_torque(rod, log)),
+        ("viscous of coordinate 1 is -0.5", lambda: by_torque(arm.replace(damping=jnp.array([0.0, -0.5])), log)),
+        ("the log has 1 sample", lambda: fit_motion(arm, log[:1])),
+        ("horizon=20 .* allows 1 to 19", lambda: fit_motion(arm, log, horizon=20)),
+        ("the log has no v", lambda: fit_motion(arm, identify.Log(t, q, tau=q))),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()
 
 
 # --- the chart of feasible models -------------------------------------------------------------------------------------
@@ -284,10 +257,8 @@ def test_the_linear_map_on_the_host_is_the_chart(wrong_iiwa):
 
         def parameters(y, chart=chart, origin=origin, size=size):
             """x near a point, with the bodies' steps after those to the origin."""
-            theta, terms = (
-                y[: len(origin) * size].reshape(len(origin), size),
-                0.1 * y[len(origin) * size :].reshape(2, 7),
-            )
+            theta, terms = jnp.split(y, [len(origin) * size])
+            theta, terms = theta.reshape(len(origin), size), 0.1 * terms.reshape(2, 7)
             inertias = chart.inertias(theta)
             if size:
                 upper = jnp.asarray(chart.factors @ origin) @ chart.relative_factors(theta)
@@ -295,8 +266,8 @@ def test_the_linear_map_on_the_host_is_the_chart(wrong_iiwa):
             return jnp.concatenate([inertias.reshape(-1), terms[0], jnp.zeros(7), terms[1], jnp.zeros(7)])
 
         y = jnp.concatenate([jnp.zeros(len(origin) * size), terms])
-        np.testing.assert_allclose(linear.x(origin, terms), jax.jit(parameters)(y), rtol=1e-12, atol=1e-14)
-        slopes = jax.jit(jax.jacfwd(parameters))(y)
+        x, slopes = jax.jit(lambda y, f=parameters: (f(y), jax.jacfwd(f)(y)))(y)
+        np.testing.assert_allclose(linear.x(origin, terms), x, rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(linear.jacobian(origin), slopes, rtol=1e-11, atol=1e-13)
         assert linear.body_jacobians(origin).shape == (7 * (size > 0), 10, size)
         np.testing.assert_array_equal(linear.start, [*[5.0] * 7, *[0.0] * 7])
@@ -332,9 +303,7 @@ def test_feasible_fit_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, i
     fit = identify.fit_torques(wrong_iiwa, iiwa_log)
     assert fit.result == jd.RESULTS.successful
     base = identify.base_parameters(iiwa, identify.TERMS)
-    true = identify.nominal_parameters(iiwa)
-    true[identify.parameter_names(iiwa).index("iiwa_joint_1.offset") :][:7] = 0.3
-    np.testing.assert_allclose(base.values(fit.vector), base.values(true), atol=2e-6)
+    np.testing.assert_allclose(base.values(fit.vector), base.values(with_offsets(iiwa)), atol=2e-6)
     assert fit.error(iiwa_log) < 1e-5
     np.testing.assert_allclose(fit.friction.offset, 0.3, atol=1e-6)
     np.testing.assert_allclose(fit.model.damping, 0.5, atol=1e-6)
@@ -483,15 +452,10 @@ def test_franka_least_squares_against_pinocchio_and_numpy(franka):
     data = reference.createData()
 
     def rows(log):
-        blocks = [
-            np.hstack(
-                [
-                    pin.computeJointTorqueRegressor(reference, data, q, v, a).copy(),
-                    *(np.diag(x) for x in (v, np.tanh(v / 0.01), np.ones(7), a)),
-                ]
-            )
-            for q, v, a in zip(log.q, log.v, log.a, strict=True)
-        ]
+        blocks = []
+        for q, v, a in zip(log.q, log.v, log.a, strict=True):
+            bodies = pin.computeJointTorqueRegressor(reference, data, q, v, a).copy()
+            blocks.append(np.hstack([bodies, *map(np.diag, (v, np.tanh(v / 0.01), np.ones(7), a))]))
         return np.array(blocks)
 
     A = rows(train).reshape(-1, 98)
@@ -547,21 +511,17 @@ def simulated_log(model, seed=0, noise=0.0):
     phase = jnp.arange(model.nv, dtype=float)[None]
     tau = 2 * jnp.sin((3 + 2 * phase) * t[:, None] + phase)
     start = 0.3 * jnp.ones(model.nv), jnp.zeros(model.nv)
-    motion = jd.simulate(
-        model, *start, t, control=identify.SampledTorque(t, tau), stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12)
-    )
+    motion = jd.simulate(model, *start, t, control=identify.SampledTorque(t, tau), stepsize=within(1e-12))
     measured = np.random.default_rng(seed).normal(scale=noise, size=(2, 101, model.nv))
     return identify.Log(t, motion.q + measured[0], motion.v + measured[1], None, tau)
 
 
-def fit_motion(model, log, shape="full", metric=None, callback=None, solver=None, **options):
+def fit_motion(model, log, shape="full", callback=None, solver=None, **options):
     """Inertias of a model by its motion."""
-    tree = identify.Parameters(model).inertias(shape=shape, metric=metric)
-    solver, execution = (
-        identify.Solver(tolerance=0.0) if solver is None else solver,
-        identify.Execution(callback=callback),
-    )
-    return identify.fit_parameters(model, log, tree, identify.Objective("trajectory", **options), solver, execution)
+    tree = identify.Parameters(model).inertias(shape=shape, metric=None)
+    objective = identify.Objective("trajectory", **options)
+    solver = identify.Solver(tolerance=0.0) if solver is None else solver
+    return identify.fit_parameters(model, log, tree, objective, solver, identify.Execution(callback=callback))
 
 
 @pytest.mark.slow

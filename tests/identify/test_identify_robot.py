@@ -5,6 +5,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
+from two_links import planar_arm, sines
 
 import jaxdyn as jd
 from benchmarks.identify_selection import false_choices
@@ -23,27 +24,15 @@ from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, is_
 
 
 def arm(stretch=0.0, seed=0):
-    """Two links that are solid in all directions; `stretch` is the size of a random change of both."""
-    builder = jd.ModelBuilder("arm")
-    moments = np.array([0.1, 0.09, 0.02])
-    builder.add_body("a", axis=(0, 1, 0), inertia=(1.0, (0.02, 0.01, -0.5), moments))
-    builder.add_body("b", "a", pose=(0, 0, -1), axis=(0, 1, 0), inertia=(0.8, (0.01, 0, -0.4), 0.8 * moments))
-    model = builder.build()
-    step = stretch * np.random.default_rng(seed).normal(size=(2, 10))
+    """The arm of two links; `stretch` is the size of a random change of both."""
+    model, step = planar_arm(), stretch * np.random.default_rng(seed).normal(size=(2, 10))
     move = jax.jit(jax.vmap(lambda x, step: inertia.from_log_cholesky(inertia.to_log_cholesky(x) + step)))
     return model.replace(inertias=move(model.inertias, step))
 
 
 def motion(seed, n=300, duration=6.0):
     """A log of a sum of sines with exact derivatives, without torques yet."""
-    generator = np.random.default_rng(seed)
-    t = np.linspace(0, duration, n)
-    amplitude, phase = generator.uniform(0.3, 1.0, (4, 2)), generator.uniform(0, 2 * np.pi, (4, 2))
-    w = np.arange(1, 5)[:, None] * 1.3
-    angle = w * t[:, None, None] + phase
-    q = np.sum(amplitude * np.sin(angle), 1)
-    v = np.sum(amplitude * w * np.cos(angle), 1)
-    return identify.Log(t, q, v, np.sum(-amplitude * w**2 * np.sin(angle), 1), np.zeros((n, 2)))
+    return identify.Log(*sines(2, n, seed, duration), np.zeros((n, 2)))
 
 
 def measured(model, log, x=None, more=0.0, noise=0.0, seed=0):
@@ -53,12 +42,33 @@ def measured(model, log, x=None, more=0.0, noise=0.0, seed=0):
     return identify.Log(log.t, log.q, log.v, log.a, tau + noise * np.random.default_rng(seed).normal(size=tau.shape))
 
 
+# A fit of the terms that are named alone, by squares.
+GIVEN = {"v_s": 0.01, "prior": 1.0, "robust": None}
+PLAIN = {"terms": identify.TERMS, **GIVEN}
+
+
 @pytest.fixture(scope="module")
 def truth():
     """Parameters of an arm with friction, rotors and offsets."""
-    x = identify.nominal_parameters(arm())
+    return true_parameters()
+
+
+def true_parameters(model=None):
+    x = identify.nominal_parameters(arm() if model is None else model)
     x[20:] = [0.3, 0.2, 0.4, 0.3, 0.1, -0.2, 0.05, 0.02]
     return x
+
+
+PAYLOAD = np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
+
+
+def with_payload(x):
+    return x + np.concatenate([np.zeros(10), PAYLOAD, np.zeros(8)])
+
+
+def sources_of(found):
+    """Where each number comes from, by name."""
+    return dict(zip(found.names, found.sources, strict=True))
 
 
 # --- several logs -----------------------------------------------------------------------------------------------------
@@ -157,9 +167,7 @@ def test_terms_that_are_there_are_recovered(truth):
         more = sum(c * term(bare, bare.tau, 0.01)[:, :, 0] for c, term in zip(coefficients, terms, strict=True))
         return measured(model, bare, truth, more)
 
-    fit = identify.fit_robot(
-        model, [log(1), log(2, 200)], (*identify.TERMS, *terms), v_s=0.01, prior=1.0, robust=None, weights=None
-    )
+    fit = identify.fit_robot(model, [log(1), log(2, 200)], (*identify.TERMS, *terms), weights=None, **GIVEN)
     assert fit.choice.trials == () and fit.fit.terms == (*identify.TERMS, "dahl", "quadratic", "cable")
     # The noise that weighs the priors is the floor, so they pull a little.
     np.testing.assert_allclose(fit.fit.extra.coefficients, coefficients, atol=1e-4)
@@ -169,9 +177,8 @@ def test_terms_that_are_there_are_recovered(truth):
     assert fit.fit.extra.by_term["cable"] == pytest.approx([0.3, -0.2], abs=1e-4)
     # Printed: a line on the fit, one on the setting, the header, and a line for each base parameter.
     head, _, *lines = str(fit).splitlines()
-    assert head.startswith("Fit: torque fit by newton, successful, loss ") and len(lines) == 1 + len(
-        fit.intervals.base.names
-    )
+    assert head.startswith("Fit: torque fit by newton, successful, loss ")
+    assert len(lines) == 1 + len(fit.intervals.base.names)
     assert len(str(fit.fit).splitlines()) == 2 + len(fit.fit.names)
 
 
@@ -186,7 +193,7 @@ def test_load_dependent_friction_follows_the_fitted_robot(truth):
         carried = identify.regressor(model, bare.q, bare.v, bare.a) @ bodies
         return measured(model, bare, truth, 0.1 * load(bare, carried, 0.01)[:, :, 0], noise)
 
-    fit = identify.fit_robot(model, log(1), (*identify.TERMS, "load"), v_s=0.01, prior=1.0, robust=None)
+    fit = identify.fit_robot(model, log(1), (*identify.TERMS, "load"), **GIVEN)
     np.testing.assert_allclose(fit.fit.extra.coefficients, 0.1, atol=3e-3)
     assert fit.fit.error(log(2, noise=0.0)) < 0.2
 
@@ -194,26 +201,18 @@ def test_load_dependent_friction_follows_the_fitted_robot(truth):
 @pytest.mark.long
 def test_loads_that_have_not_settled_are_said(truth, monkeypatch):
     """Friction in proportion to the load of the fit before: three fits leave it three standard deviations off."""
-    model = arm(0.2, 3)
-
-    def log(seed):
-        bare = measured(arm(), motion(seed), truth)
-        load = bare.tau - identify.regressor(arm(), bare.q, bare.v, bare.a)[:, :, 20:] @ truth[20:]
-        return measured(arm(), bare, truth, 0.1 * np.abs(load) * np.tanh(bare.v / 0.01), 0.002, seed)
-
-    given = {"v_s": 0.01, "prior": 1.0, "robust": None}
-    terms = (*identify.TERMS, "load")
-    fit = identify.fit_robot(model, log(1), terms, **given)
+    model, terms, bare = arm(0.2, 3), (*identify.TERMS, "load"), measured(arm(), motion(1), truth)
+    load = bare.tau - identify.regressor(arm(), bare.q, bare.v, bare.a)[:, :, 20:] @ truth[20:]
+    log = measured(arm(), bare, truth, 0.1 * np.abs(load) * np.tanh(bare.v / 0.01), 0.002, 1)
+    fit = identify.fit_robot(model, log, terms, **GIVEN)
     assert fit.fit.result is jd.RESULTS.successful
-    loaded = truth.copy()
-    loaded[10:20] += np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
-    held = measured(arm(), motion(3), loaded, noise=0.02, seed=3)
-    assert bool(identify.fit_payload(model, log(1), held, robot=fit).success)
+    held = measured(arm(), motion(3), with_payload(truth), noise=0.02, seed=3)
+    assert bool(identify.fit_payload(model, log, held, robot=fit).success)
     monkeypatch.setattr("jaxdyn.identify.payloads.MAX_ROUNDS", 1)
-    short = identify.fit_payload(model, log(1), held, robot=fit)
+    short = identify.fit_payload(model, log, held, robot=fit)
     assert short.result is jd.RESULTS.max_steps_reached and "NOT CONVERGED" in payload_text(short)
     basic, extra, where = split_terms(terms, 2)
-    problem = RobotLogs(model, (log(1),), basic, extra, "full", 20)
+    problem = RobotLogs(model, (log,), basic, extra, "full", 20)
     for rounds, code in ((3, jd.RESULTS.max_steps_reached), (30, jd.RESULTS.successful)):
         assert problem.refine(Setting(0.01, where, 1.0), None, rounds).result is code
 
@@ -224,7 +223,7 @@ def test_friction_goes_through_the_filter_of_the_log(truth):
     raw = measured(model, motion(1, 12001, 24.0), truth)
     log = identify.from_raw(raw.t, raw.q, raw.tau, cutoff=8.0, trim=200, every=4)
     assert log.cutoff == log[10:].cutoff == 8.0 and raw.cutoff is None
-    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None, weights=None).fit
+    fit = identify.fit_robot(model, log, weights=None, **PLAIN).fit
     plain = identify.least_squares(model, log, v_s=0.01)  # whose column of friction did not go through the filter
     assert fit.error(log) < 0.2 * plain.error(log)
     np.testing.assert_allclose(identify.fit_torques(model, log, v_s=0.01).vector, fit.vector, rtol=1e-6, atol=1e-8)
@@ -267,7 +266,7 @@ def test_choice_by_cross_validation(truth):
     # A smooth sign of 0.003 or 0.03 rad/s differs from one of 0.01 in few samples of these logs.
     assert 0.001 <= fit.choice.setting.v_s <= 0.03
     assert len(told) == len(fit.choice.trials) and "halves of the samples" in fit.choice.by
-    plain = identify.fit_robot(model, [log(1), log(2)], identify.TERMS, v_s=0.01, prior=1.0, robust=None)
+    plain = identify.fit_robot(model, [log(1), log(2)], **PLAIN)
     assert fit.fit.error(log(3)) < plain.fit.error(log(3))
 
 
@@ -327,9 +326,8 @@ def test_weights_are_one_over_the_root_of_the_noise_of_each_joint(truth):
     model = arm()
     bare = motion(1, 600)
     log = measured(model, bare, truth, np.random.default_rng(5).normal(size=(600, 2)) * [0.5, 0.02])
-    fit = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None)
+    fit, even = (identify.fit_robot(model, log, weights=weights, **PLAIN) for weights in ("auto", None))
     assert fit.weights[1] / fit.weights[0] == pytest.approx(5, rel=0.08)
-    even = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None, weights=None)
     base = fit.intervals.combinations
     off = [np.linalg.norm((base.values(f.fit.vector) - base.values(truth))[3:6]) for f in (fit, even)]
     assert off[0] < off[1]
@@ -367,12 +365,10 @@ def coverage(noises, count, size=0.05):
     """
     inside, sizes = [], []
     for seed in range(count):
-        model, nominal = arm(0.2, seed), arm()
-        x = identify.nominal_parameters(model)
-        x[20:] = [0.3, 0.2, 0.4, 0.3, 0.1, -0.2, 0.05, 0.02]
-        bare = motion(seed)
+        model, bare = arm(0.2, seed), motion(seed)
+        x = true_parameters(model)
         log = measured(model, bare, x, size * noises(seed, len(bare)))
-        fit = identify.fit_robot(nominal, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals
+        fit = identify.fit_robot(arm(), log, **PLAIN).intervals
         off = np.abs(fit.base.values - fit.combinations.values(x))
         inside.append(off <= fit.factor * fit.base.std)
         sizes.append(off / fit.base.std)
@@ -432,7 +428,7 @@ def recorded_coverage(kind, seeds, rate=500):
         cutoff = identify.choose_cutoff(identify.Log(t, q, tau=tau)).frequency
         every = max(1, int(rate / (15 * cutoff)))
         log = identify.from_raw(t, q, tau, cutoff=cutoff, every=every, trim=38 * every)
-        fit = identify.fit_robot(model, log, identify.TERMS, v_s=v_s, prior=1.0, robust=None).intervals
+        fit = identify.fit_robot(model, log, **{**PLAIN, "v_s": v_s}).intervals
         inside = np.abs(fit.base.values - fit.combinations.values(x)) <= fit.factor * fit.base.std
         is_friction = np.array([name.endswith((".viscous", ".coulomb", ".offset")) for name in fit.base.names])
         bodies.append(inside[~is_friction])
@@ -490,8 +486,8 @@ def test_numbers_of_a_direction_without_data_and_prior_have_no_interval(truth):
     wave = np.sin(3 * t)[:, None] * [1.0, 0.0]
     q, v, a = (wave + t[:, None] * [0, 2.0], 3 * np.cos(3 * t)[:, None] * [1.0, 0.0] + [0, 2.0], -9 * wave)
     log = measured(model, identify.Log(t, q, v, a, 0 * q), truth, noise=0.0)
-    found = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals.parameters
-    source = dict(zip(found.names, found.sources, strict=True))
+    found = identify.fit_robot(model, log, **PLAIN).intervals.parameters
+    source = sources_of(found)
     lost = {name for name, word in source.items() if word == "undetermined"}
     # At constant speed viscous friction is constant too, and no torque accelerates the rotor.
     assert lost == {"b_joint.coulomb", "b_joint.offset", "b_joint.viscous", "b_joint.armature"}
@@ -504,24 +500,20 @@ def test_a_term_that_is_left_out_is_named_and_within_the_intervals(truth):
     model, log = arm(), motion(2, 600, 12.0)
     more = np.stack([0 * log.v[:, 0], 0.05 * log.v[:, 1] * np.abs(log.v[:, 1])], axis=1)
     log = measured(model, log, truth, more, noise=0.02)
-    options = dict(v_s=0.01, prior=1.0, robust=None)
-    lacking = identify.fit_robot(model, log, identify.TERMS, **options).intervals
-    whole = identify.fit_robot(model, log, (*identify.TERMS, "quadratic"), **options).intervals
+    lacking = identify.fit_robot(model, log, **PLAIN).intervals
+    whole = identify.fit_robot(model, log, (*identify.TERMS, "quadratic"), **GIVEN).intervals
     assert ("quadratic", 1) in lacking.omitted and {joint for _, joint in lacking.omitted} == {1}
     assert whole.omitted == ()
     place = lacking.parameters.names.index("b_joint.viscous")
     off = abs(lacking.parameters.values[place] - truth[21])
     # Outside of an interval as wide as that of the true model, and within the one that holds both fits.
     assert whole.factor * whole.parameters.std[place] < off < lacking.factor * lacking.parameters.std[place]
-    both = (
-        abs(whole.parameters.values[place] - lacking.parameters.values[place])
-        + whole.factor * whole.parameters.std[place]
-    )
+    apart = abs(whole.parameters.values[place] - lacking.parameters.values[place])
+    both = apart + whole.factor * whole.parameters.std[place]
     # One Newton step, with the weights of the fit without the term.
     np.testing.assert_allclose(lacking.factor * lacking.parameters.std[place], both, rtol=0.2)
     # Parameters of a joint's friction do not move where only the other one has the term.
-    complete = identify.fit_robot(model, measured(model, log, truth, noise=0.02), identify.TERMS, **options).intervals
-    assert complete.omitted == ()
+    assert identify.fit_robot(model, measured(model, log, truth, noise=0.02), **PLAIN).intervals.omitted == ()
 
 
 def test_a_wrong_model_widens_the_scatter_of_long_logs():
@@ -590,16 +582,13 @@ def test_intervals_cover_for_many_arms(noises):
 
 def test_what_no_data_touch_is_from_the_prior(truth):
     model = arm()
-    fit = identify.fit_robot(
-        model, measured(model, motion(1), truth, noise=0.05), v_s=0.01, prior=1.0, robust=None
-    ).intervals
-    sources = dict(zip(fit.parameters.names, fit.parameters.sources, strict=True))
+    fit = identify.fit_robot(model, measured(model, motion(1), truth, noise=0.05), **GIVEN).intervals
+    sources = sources_of(fit.parameters)
     assert sources["a.Ixx"] == sources["b.Izz"] == "prior"  # the arm moves in a plane
     assert sources["b_joint.viscous"] == sources["b_joint.coulomb"] == "data"
-    base = dict(zip(fit.base.names, fit.base.sources, strict=True))
-    assert base["b.mcz"] == "data"
+    assert sources_of(fit.base)["b.mcz"] == "data"
     no_friction = measured(model, motion(1), truth * np.repeat([1, 0, 1], [20, 4, 4]), noise=0.05)
-    fit = identify.fit_robot(model, no_friction, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals.parameters
+    fit = identify.fit_robot(model, no_friction, **PLAIN).intervals.parameters
     at_bound = fit.values[20:24] == 0
     assert np.isnan(fit.std[20:24][at_bound]).all() and np.isfinite(fit.std[20:24][~at_bound]).all()
 
@@ -626,9 +615,8 @@ def test_white_residuals():
     assert is_white([low], [low.tau]).tolist() == [False, True]
     assert is_white([low, low], [low.tau, low.tau]).tolist() == [False, True]
     generator = np.random.default_rng(1)
-    assert (
-        is_white([raw, raw[:1]], [slow, slow[:1]]).tolist() == [False, True] and is_white([raw[:1]], [slow[:1]]).all()
-    )
+    assert is_white([raw, raw[:1]], [slow, slow[:1]]).tolist() == [False, True]
+    assert is_white([raw[:1]], [slow[:1]]).all()
     false = [not is_white([raw], [generator.normal(size=(2001, 1))]).all() for _ in range(300)]
     assert sum(false) <= 3
 
@@ -647,15 +635,12 @@ def test_dahl_friction_is_confounded_with_coulomb_friction(truth):
     model, dahl = arm(), identify.EXTRA["dahl"]
     bare = motion(1, 600)
     log = measured(model, bare, truth, 0.5 * np.array([1, 0]) * dahl(bare, bare.tau, 0.01)[:, :, 0], 0.05)
-    fit = identify.fit_robot(model, log, (*identify.TERMS, ("dahl", (0,))), v_s=0.01, prior=1.0, robust=None)
-    spread = fit.intervals.parameters
-    sources = dict(zip(spread.names, spread.sources, strict=True))
+    fit = identify.fit_robot(model, log, (*identify.TERMS, ("dahl", (0,))), **GIVEN)
+    sources, base = sources_of(fit.intervals.parameters), sources_of(fit.intervals.base)
     assert sources["a_joint.coulomb"] == sources["a_joint.dahl"] == "confounded"
     assert sources["a_joint.viscous"] == sources["b_joint.coulomb"] == "data"
-    base = dict(zip(fit.intervals.base.names, fit.intervals.base.sources, strict=True))
     assert base["a_joint.coulomb"] == "confounded" and base["b_joint.coulomb"] == "data"
-    plain = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals.parameters
-    assert "confounded" not in plain.sources
+    assert "confounded" not in identify.fit_robot(model, log, **PLAIN).intervals.parameters.sources
 
 
 @pytest.mark.long
@@ -668,11 +653,10 @@ def test_a_joint_that_hardly_moved_has_no_friction_from_data(truth):
     log = measured(model, slow, truth, noise=0.05)
     with pytest.warns(identify.LogWarning, match=r"log 1: b_joint .* hardly moved"):
         fit = identify.fit_robot(model, log)
-    sources = dict(zip(fit.intervals.parameters.names, fit.intervals.parameters.sources, strict=True))
-    for term in identify.TERMS:
-        assert sources[f"b_joint.{term}"] in ("hardly moved", "bound")
-    base = dict(zip(fit.intervals.base.names, fit.intervals.base.sources, strict=True))
-    assert all(source in ("hardly moved", "bound") for name, source in base.items() if name.startswith("b_joint."))
+    sources, base = sources_of(fit.intervals.parameters), sources_of(fit.intervals.base)
+    of_joint = [sources[f"b_joint.{term}"] for term in identify.TERMS]
+    of_joint += [source for name, source in base.items() if name.startswith("b_joint.")]
+    assert set(of_joint) <= {"hardly moved", "bound"}
     assert not any(1 in joints for _, joints in fit.choice.setting.extra)
     (line,) = check_log_content(model, log, ("a", "b"))
     assert line.startswith("b (0.005 rad) hardly moved: friction and rotor inertia there are not identifiable")
@@ -734,18 +718,13 @@ def test_saturated_torques_are_named():
         assert check_saturation(identify.Log(log.t, log.q, log.v, log.a, tau)) == []
 
 
-def test_torques_that_no_fit_explains_are_named(truth):
+def test_fits_warn_of_torques_that_do_not_fit_of_other_units_and_of_starts_at_rest(truth):
+    """By the lines of the command, with the number of the log; the rest is a second with a torque of its own."""
     model, good = arm(), measured(arm(), motion(1), truth, noise=0.01)
-    given = {"terms": identify.TERMS, "v_s": 0.01, "prior": 1.0, "robust": None, "weights": None}
+    given = {**PLAIN, "weights": None}
     turned = identify.Log(good.t, good.q, good.v, good.a, -good.tau)
     with pytest.warns(identify.LogWarning, match="the fit leaves most .* of a_joint, b_joint"):
         identify.fit_robot(model, turned, **given)
-
-
-def test_fits_warn_of_logs_in_other_units_and_of_starts_at_rest(truth):
-    """By the lines of the command, with the number of the log; the rest is a second with a torque of its own."""
-    model, good = arm(), measured(arm(), motion(1), truth, noise=0.01)
-    given = {"terms": identify.TERMS, "v_s": 0.01, "prior": 1.0, "robust": None, "weights": None}
     scaled = identify.Log(good.t, good.q, good.v, good.a, 1000 * good.tau)
     with pytest.warns(identify.LogWarning) as found:
         identify.fit_robot(model, [good, scaled], **given)
@@ -766,18 +745,14 @@ def test_an_error_at_rest_is_named():
     log = identify.Log(t, v, v, v, v)
     (line,) = check_rest(log, residual, ("a", "b"))
     assert line.startswith("a stands still for the first 1 s") and "friction at rest" in line
-    assert (
-        check_rest(log, 0 * residual, ("a", "b")) == []
-        and check_rest(identify.Log(t, v, 0 * v, v, v), residual, "ab") == []
-    )
+    assert check_rest(log, 0 * residual, "ab") == check_rest(identify.Log(t, v, 0 * v, v, v), residual, "ab") == []
 
 
 def test_vibration_is_told_from_friction():
     """A residual at the motion's own frequencies is none; one at 15 Hz is, and the edge is ten times the motion's band."""
     t = np.linspace(0, 10, 2001)[:, None]
-    log = identify.Log(
-        t[:, 0], np.sin(2 * np.pi * t), 2 * np.pi * np.cos(2 * np.pi * t), -40 * np.sin(2 * np.pi * t), t
-    )
+    w = 2 * np.pi
+    log = identify.Log(t[:, 0], np.sin(w * t), w * np.cos(w * t), -(w**2) * np.sin(w * t), t)
     slow, fast = np.sin(4 * np.pi * t), np.sin(30 * np.pi * t)
     assert motion_band(log) == pytest.approx(1.0, abs=0.21)  # the window's width is two tenths of a hertz
     share, edge = vibration(log, slow + fast)
@@ -794,17 +769,14 @@ def test_vibration_is_told_from_friction():
 def test_payload_is_what_loaded_logs_differ_by(truth):
     """A wrong nominal robot, friction and noise: mass, centre and inertia come back within their intervals."""
     model, nominal = arm(), arm(0.2, 3)
-    held = np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
-    x = truth.copy()
-    x[10:20] += held
     unloaded = [measured(model, motion(seed), truth, noise=0.02, seed=seed) for seed in (1, 2)]
-    loaded = measured(model, motion(3), x, noise=0.02, seed=3)
-    fit = identify.fit_payload(nominal, unloaded, loaded, terms=identify.TERMS, v_s=0.01, prior=1.0, robust=None)
+    loaded = measured(model, motion(3), with_payload(truth), noise=0.02, seed=3)
+    fit = identify.fit_payload(nominal, unloaded, loaded, **PLAIN)
     assert fit.body == "b" and fit.error < 0.5 * fit.without
     # A planar arm shows m x, m z and the inertia about its axis alone, and not the mass without them.
     seen = [1, 3, 6]
-    assert np.all(np.abs(fit.inertia - held)[seen] <= fit.factor * fit.std[seen] + 1e-3)
-    assert np.abs(fit.inertia - held)[seen].max() < 0.03
+    off = np.abs(fit.inertia - PAYLOAD)[seen]
+    assert np.all(off <= fit.factor * fit.std[seen] + 1e-3) and off.max() < 0.03
     assert inertia.is_feasible(fit.inertia)
     with pytest.raises(ValueError, match="body is 'hand'"):
         identify.fit_payload(nominal, unloaded, loaded, "hand")
@@ -820,12 +792,14 @@ def test_a_robust_loss_is_bent_less_by_torques_that_no_robot_makes(truth):
     burst = np.zeros((300, 2))
     burst[40:55, 1] = burst[180:190, 1] = 4.0
     log = measured(model, motion(1), truth, burst, 0.05)
-    given = {"terms": identify.TERMS, "v_s": 0.01, "prior": 1.0}
-    plain = identify.fit_robot(model, log, robust=None, **given)
-    robust = identify.fit_robot(model, log, robust=1.345, **given)
-    off = [np.linalg.norm(f.intervals.base.values - f.intervals.combinations.values(truth)) for f in (plain, robust)]
+
+    def fit(log, robust):
+        return identify.fit_robot(model, log, **{**PLAIN, "robust": robust})
+
+    fits = [fit(log, robust).intervals for robust in (None, 1.345)]
+    off = [np.linalg.norm(f.base.values - f.combinations.values(truth)) for f in fits]
     assert off[1] < 0.5 * off[0]
-    chosen = identify.fit_robot(model, [log, measured(model, motion(2), truth, 0, 0.05)], robust="auto", **given)
+    chosen = fit([log, measured(model, motion(2), truth, 0, 0.05)], "auto")
     # Losses are compared by errors of their own; squares and the loss that is taken are among the trials.
     loss = chosen.choice.setting.robust
     assert loss in (1.345, 3.0) and {trial.setting.robust for trial in chosen.choice.trials} == {None, loss}
@@ -835,7 +809,7 @@ def test_a_robust_loss_is_bent_less_by_torques_that_no_robot_makes(truth):
     np.testing.assert_array_equal(huber_weights([np.zeros((3, 1))], 1.0)[0], 1.0)
     for bad in (0.0, "huber"):
         with pytest.raises(ValueError, match="robust is"):
-            identify.fit_robot(model, log, robust=bad, **given)
+            fit(log, bad)
 
 
 # --- what logs tell ---------------------------------------------------------------------------------------------------
@@ -867,23 +841,21 @@ def test_whiteness_of_known_noise():
         slow[i] = r * slow[i - 1] + noise[i]
     t = 0.01 * np.arange(n)
     x = np.stack([noise, slow, np.zeros(n)], axis=1)
-    computed = identify.whiteness(identify.Log(t, x, tau=x), x)
+    log = identify.Log(t, x, tau=x)
+    computed = identify.whiteness(log, x)
     # The sum of the correlation up to its first zero has a standard error of some per cent.
-    assert computed.correlation_time[0] == pytest.approx(0.01, rel=0.1) and computed.effective_samples[
-        0
-    ] == pytest.approx(n, rel=0.1)
+    assert computed.correlation_time[0] == pytest.approx(0.01, rel=0.1)
+    assert computed.effective_samples[0] == pytest.approx(n, rel=0.1)
     assert computed.correlation_time[1] == pytest.approx(0.19, rel=0.15)
     assert computed.correlation_time[2] == pytest.approx(0.01)
-    constant = identify.whiteness(
-        identify.Log(t, x, tau=x), np.stack([noise, np.full(n, 0.3), np.full(n, 1e-9)], axis=1)
-    )
+    constant = identify.whiteness(log, np.stack([noise, np.full(n, 0.3), np.full(n, 1e-9)], axis=1))
     np.testing.assert_allclose(constant.effective_samples[1:], 1.0)
     for wrong in (np.nan, np.inf):
         x[7, 1] = wrong
         with pytest.raises(ValueError, match=f"residual is {wrong} in row 7, column 1"):
-            identify.whiteness(identify.Log(t, slow[:, None], tau=slow[:, None]), x)
-    with pytest.raises(ValueError, match=r"residual has shape \(3, 1\), expected \(40000, nv\)"):
-        identify.whiteness(identify.Log(t, slow[:, None], tau=slow[:, None]), np.zeros((3, 1)))
+            identify.whiteness(log, x)
+    with pytest.raises(ValueError, match=r"residual has shape \(3, 1\)"):
+        identify.whiteness(log, np.zeros((3, 1)))
 
 
 # --- excitation -------------------------------------------------------------------------------------------------------

@@ -27,28 +27,24 @@ MENDED = {
 # One follows a joint that is missing, which a model alone ignores.
 LOADED = [name for name in FILES if name not in MENDED or "mimic=" in MENDED[name]]
 MIMIC = ["panda_description/urdf/panda.urdf", "baxter_description/urdf/baxter.urdf"]
-ROUND_TRIPS = [
-    ("panda_description/urdf/panda.urdf", False),  # with a joint that follows another one
-    (
-        "tiago_pro_description/robots/tiago_pro.urdf",
-        False,
-    ),  # siblings out of the order of their names, continuous joints
-    ("g1_description/urdf/g1_29dof_rev_1_0.urdf", True),
-    ("hector_description/robots/quadrotor_base.urdf", False),  # one body
-    ("hector_description/robots/quadrotor_base.urdf", True),
-]
-INERTIAS = [
-    "talos_data/robots/talos_reduced.urdf",
-    "romeo_description/urdf/romeo_small.urdf",
-    "pr2_description/urdf/pr2.urdf",
-]
+# A joint that follows another one; siblings out of the order of their names, and continuous joints; one body.
+TIAGO, ONE_BODY = "tiago_pro_description/robots/tiago_pro.urdf", "hector_description/robots/quadrotor_base.urdf"
+ROUND_TRIPS = [(MIMIC[0], False), (TIAGO, False), ("g1_description/urdf/g1_29dof_rev_1_0.urdf", True)]
+ROUND_TRIPS += [(ONE_BODY, False), (ONE_BODY, True)]
+TALOS = "talos_data/robots/talos_reduced.urdf"
+INERTIAS = [TALOS, "romeo_description/urdf/romeo_small.urdf", "pr2_description/urdf/pr2.urdf"]
 LEAVES = ("home", "screws", "inertias", "frame_poses", "gravity", "armature", "damping", "friction", "lower", "upper")
 LEAVES += ("velocity_limit", "effort_limit", "coupling_values")
 
 
 def in_pinocchio(name, floating=False):
-    path = str(Path(ROBOTS) / name)
-    return pin.buildModelFromUrdf(path, pin.JointModelFreeFlyer()) if floating else pin.buildModelFromUrdf(path)
+    return pin.buildModelFromUrdf(str(Path(ROBOTS) / name), *[pin.JointModelFreeFlyer()] * floating)
+
+
+def locked_in_pinocchio(source, names, q=None):
+    """The model without these joints, which are held at a configuration, by default the neutral one."""
+    numbers = [source.getJointId(name) for name in names]
+    return pin.buildReducedModel(source, numbers, pin.neutral(source) if q is None else q)
 
 
 def assert_same_as_pinocchio(model, source):
@@ -102,37 +98,19 @@ def assert_same_models(one, two, rtol=1e-12):
             np.testing.assert_allclose(b, a, rtol=rtol, atol=rtol * finite.max(initial=0.0), err_msg=name)
 
 
-def some(names: list[str], step: int) -> list:
+def some(names: list[str], step: int, *more) -> list:
     """All of the names, of which others than every `step`-th run with the slow tests."""
-    return [
-        pytest.param(x, marks=pytest.mark.slow if i % step and x not in MENDED else ()) for i, x in enumerate(names)
-    ]
+    slow = [pytest.mark.slow if i % step and x not in MENDED else () for i, x in enumerate(names)]
+    return [pytest.param(x, *more, marks=marks) for x, marks in zip(names, slow, strict=True)]
 
 
-@pytest.mark.parametrize("name", some(LOADED, 3))
-def test_robot_is_the_one_that_pinocchio_loads(name):
-    assert_same_as_pinocchio(jd.load_model(Path(ROBOTS) / name), in_pinocchio(name))
+@pytest.mark.parametrize(("name", "floating"), some(LOADED, 3, False) + some(LOADED, 6, True))
+def test_robot_is_the_one_that_pinocchio_loads(name, floating):
+    model = jd.load_model(Path(ROBOTS) / name, floating_base=floating)
+    assert_same_as_pinocchio(model, in_pinocchio(name, floating))
 
 
-@pytest.mark.parametrize("name", some(LOADED, 6))
-def test_robot_with_floating_base_is_the_one_that_pinocchio_loads(name):
-    model = jd.load_model(Path(ROBOTS) / name, floating_base=True)
-    assert_same_as_pinocchio(model, in_pinocchio(name, floating=True))
-
-
-def test_the_list_of_joints_to_lock_in_the_refusal_is_enough():
-    path = Path(ROBOTS) / "romeo_description/urdf/romeo_laas_small.urdf"
-    with pytest.raises(ValueError) as refusal:
-        jd.load_model(path)
-    names = str(refusal.value).split("lock=[")[1].split("]")[0].replace("'", "").split(", ")
-    source = in_pinocchio("romeo_description/urdf/romeo_laas_small.urdf")
-    reduced = pin.buildReducedModel(source, [source.getJointId(name) for name in names], pin.neutral(source))
-    assert_same_as_pinocchio(jd.load_model(path, lock=names), reduced)
-
-
-@pytest.mark.parametrize(
-    "name", ["talos_data/robots/talos_reduced.urdf", "tiago_description/robots/tiago_no_hand.urdf"]
-)
+@pytest.mark.parametrize("name", [TALOS, "tiago_description/robots/tiago_no_hand.urdf"])
 @pytest.mark.parametrize("floating", [False, True])
 def test_locked_joints_give_pinocchios_reduced_model(name, floating):
     source = in_pinocchio(name, floating)
@@ -144,12 +122,9 @@ def test_locked_joints_give_pinocchios_reduced_model(name, floating):
         place = source.joints[source.getJointId(joint)]
         number = [np.cos(value), np.sin(value)] if place.nq == 2 else value
         q[place.idx_q : place.idx_q + place.nq] = number
-    reduced = pin.buildReducedModel(source, [source.getJointId(joint) for joint in values], q)
-    model = jd.load_model(Path(ROBOTS) / name, floating_base=floating, lock=values)
-    assert_same_as_pinocchio(model, reduced)
-    at_zero = jd.load_model(Path(ROBOTS) / name, floating_base=floating, lock=list(values))
-    reduced = pin.buildReducedModel(source, [source.getJointId(joint) for joint in values], pin.neutral(source))
-    assert_same_as_pinocchio(at_zero, reduced)
+    for lock, place in ((values, q), (list(values), None)):
+        model = jd.load_model(Path(ROBOTS) / name, floating_base=floating, lock=lock)
+        assert_same_as_pinocchio(model, locked_in_pinocchio(source, values, place))
 
 
 # Small files for single features and faults ---------------------------------------------------------------------------
@@ -204,16 +179,13 @@ def test_defaults_of_a_joint(urdf):
     assert model.home.dtype == np.float32
     half = jd.load_model(urdf(link("a"), joint("j", "a", "b", '<limit upper="1"/>'), link("b")))
     assert [float(half.lower[0]), float(half.upper[0]), float(half.effort_limit[0])] == [0, 1, np.inf]
-    free = jd.load_model(
-        urdf(link("a"), joint("j", "a", "b", '<limit upper="1" effort="5"/>', "continuous"), link("b"))
-    )
+    limit = '<limit upper="1" effort="5"/>'
+    free = jd.load_model(urdf(link("a"), joint("j", "a", "b", limit, "continuous"), link("b")))
     assert [float(free.upper[0]), float(free.effort_limit[0])] == [np.inf, 5]
 
 
 def test_what_is_only_seen_is_not_read(urdf):
-    broken = (
-        '<visual><origin xyz="what"/><geometry><mesh filename="package://no/where.dae" scale="x"/></geometry></visual>'
-    )
+    broken = '<visual><origin xyz="what"/><geometry><mesh filename="package://a/b.dae" scale="x"/></geometry></visual>'
     assert jd.load_model(urdf(link("a"), joint("j", "a", "b"), link("b", SOLID + broken))).nb == 1
 
 
@@ -273,9 +245,8 @@ def test_base_is_locked_where_it_is_told(urdf):
     path = urdf(link("a"), joint("j", "a", "b"), link("b"))
     model = jd.load_model(path, floating_base=True, lock={"root_joint": [1, 2, 3, 0, 0, 0, 2]})
     assert model.joint_names == ("j",)
-    np.testing.assert_allclose(
-        model.home[0], np.diag([-1.0, -1, 1, 1]) + np.outer([1, 2, 3, 0], [0, 0, 0, 1]), atol=1e-16
-    )
+    home = np.diag([-1.0, -1, 1, 1]) + np.outer([1, 2, 3, 0], [0, 0, 0, 1])
+    np.testing.assert_allclose(model.home[0], home, atol=1e-16)
 
 
 def test_root_joint_gives_way_to_a_joint_of_that_name(urdf):
@@ -287,9 +258,8 @@ def test_mimic_joints():
     panda, baxter = (Path(ROBOTS) / name for name in MIMIC)
     assert jd.load_model(panda).topology.couplings == ()
     model = jd.load_model(panda, mimic="couple")
-    assert [(model.joint_names[i], model.joint_names[k]) for i, k in model.topology.couplings] == [
-        ("panda_finger_joint2", "panda_finger_joint1")
-    ]
+    follower, leader = (f"panda_finger_joint{i}" for i in (2, 1))
+    assert [(model.joint_names[i], model.joint_names[k]) for i, k in model.topology.couplings] == [(follower, leader)]
     np.testing.assert_array_equal(model.coupling_values, [[1.0, 0.0]])
     assert model.nv == 9
     with pytest.raises(ValueError, match=r"panda_finger_joint2 .*mimic='couple'"):
@@ -299,14 +269,13 @@ def test_mimic_joints():
     model = jd.load_model(baxter, mimic="couple")
     assert sorted(model.coupling_values[:, 0].tolist()) == [-1, -1]
     # A follower of a locked joint is locked where the coupling puts it.
-    held = jd.load_model(panda, mimic="couple", lock={"panda_finger_joint1": 0.03})
-    expected = jd.load_model(panda, lock={"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.03})
-    assert_same_models(held, expected)
-    assert jd.load_model(panda, lock=["panda_finger_joint1"]).nv == 8
-    with pytest.raises(ValueError, match="'panda_finger_joint2' follows 'panda_finger_joint1'"):
-        jd.load_model(panda, mimic="couple", lock=["panda_finger_joint2"])
-    with pytest.raises(ValueError, match="'panda_finger_joint2' is held at"):
-        jd.load_model(panda, mimic="couple", lock={"panda_finger_joint1": 0.03, "panda_finger_joint2": 0.01})
+    held = jd.load_model(panda, mimic="couple", lock={leader: 0.03})
+    assert_same_models(held, jd.load_model(panda, lock={leader: 0.03, follower: 0.03}))
+    assert jd.load_model(panda, lock=[leader]).nv == 8
+    with pytest.raises(ValueError, match=f"'{follower}' follows '{leader}'"):
+        jd.load_model(panda, mimic="couple", lock=[follower])
+    with pytest.raises(ValueError, match=f"'{follower}' is held at"):
+        jd.load_model(panda, mimic="couple", lock={leader: 0.03, follower: 0.01})
 
 
 def test_chains_of_mimic_joints(urdf):
@@ -430,20 +399,17 @@ def test_bad_arguments(urdf, tmp_path):
         jd.load_model(tmp_path)
 
 
-def test_units_that_look_wrong_are_said_aloud(tmp_path):
+def test_units_that_look_wrong_are_said_aloud(urdf):
     """Degrees and millimetres; 1e16 stands for no limit."""
-    text = """<robot name="r"><link name="a"/>
-    <link name="b"><inertial><mass value="1"/><inertia ixx="2e4" iyy="2e4" izz="2e4" ixy="0" ixz="0" iyz="0"/></inertial></link>
-    <joint name="j" type="revolute"><origin xyz="350 0 0"/><parent link="a"/><child link="b"/>
-    <limit lower="-90" upper="1e16" effort="1" velocity="1"/></joint></robot>"""
-    path = tmp_path / "robot.urdf"
-    path.write_text(text, encoding="utf-8")
+    limit = '<origin xyz="350 0 0"/><limit lower="-90" upper="1e16" effort="1" velocity="1"/>'
+    heavy = '<inertial><mass value="1"/><inertia ixx="2e4" iyy="2e4" izz="2e4" ixy="0" ixz="0" iyz="0"/></inertial>'
+    text = (path := urdf(link("a"), link("b", heavy), joint("j", "a", "b", limit))).read_text()
     for read in (jd.load_model, jd.load):
         with pytest.warns(jd.io.UnitsWarning) as caught:
             read(path)
         for part in ("robot.urdf", "rad of joint 'j' (degrees?)", "body 'b' 350 m", "radius of gyration 141.421 m"):
             assert part in str(caught[0].message)
-    path.write_text(text.replace("-90", "-1e16").replace("2e4", "0.1").replace("350", "0.35"), encoding="utf-8")
+    path.write_text(text.replace("-90", "-1e16").replace("2e4", "0.1").replace("350", "0.35"))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jd.load_model(path)
@@ -455,10 +421,8 @@ def test_inertia_report_names_links(urdf):
     frame = joint("f", "flat", "frame", kind="fixed")
     moves = [joint(f"j{i}", *ends) for i, ends in enumerate((("a", "flat"), ("a", "long"), ("a", "bare")))]
     end = joint("j3", "bare", "tip", '<axis xyz="0 1 0"/>')
-    path = urdf(
-        link("a", ""), link("flat", flat), link("long", long), link("bare", ""), link("frame", ""), frame, *moves
-    )
-    path.write_text(path.read_text().replace("</robot>", link("tip") + end + "</robot>"))
+    links = {"a": "", "flat": flat, "long": long, "bare": "", "frame": "", "tip": SOLID}
+    path = urdf(*(link(*one) for one in links.items()), frame, *moves, end)
     report = jd.io.urdf_inertia_report(path)
     assert [(name, problem.split(":")[0]) for name, problem in report] == [
         ("flat", "not positive definite"),
@@ -539,9 +503,7 @@ def test_round_trip_of_all_that_a_model_can_hold(tmp_path):
     builder.add_body("c", "b", "prismatic", ball, friction=0.3, upper=1 / 3, axis=(0, -1, 0))
     builder.add_body("d", "c", "planar", ball, damping=0.4)
     builder.add_body("e", "d", "free", ball).add_frame("tool", "e", ((1, 2, 3), (4, 5, 6)))
-    builder.add_body("m", "e", "revolute", armature=1e-3).add_body(
-        "rotor", "e", armature=1.0, inertia=[0] * 4 + [1, 0, 1, 0, 0, 1]
-    )
+    builder.add_body("m", "e", armature=1e-3).add_body("rotor", "e", armature=1.0, inertia=[0] * 4 + [1, 0, 1, 0, 0, 1])
     builder.add_coupling("c_joint", "a_joint", 0.5, -0.25)
     model = builder.build()
     assert_same_models(model, saved(model, tmp_path / "out.urdf", mimic="couple"), rtol=1e-15)
@@ -633,32 +595,27 @@ def test_encodings_that_the_declaration_names(encoding, tmp_path):
         (b'<?xml version="1.0" encoding="quux"?><robot/>', (":1: the encoding 'quux'", "unknown")),
         (b'<?xml version="1.0" encoding="utf-16"?><robot/>', (":1: the XML declaration says utf-16", "leave it out")),
         (b'<?xml version="1.0" encoding="hex"?><robot/>', (":1: the encoding 'hex'",)),
-        (
-            '<?xml version="1.0" encoding="gbk"?>\n<robot name="机">\n<link name="a"></robot>'.encode("gbk"),
-            (":3: malformed",),
-        ),
+        ('<?xml version="1.0" encoding="gbk"?>\n<robot name="机">\n<link></robot>'.encode("gbk"), (":3: malformed",)),
     ],
 )
-@pytest.mark.parametrize("reader", [jd.load_model, jd.load, jd.pictures.shapes])
-@pytest.mark.parametrize("suffix", [".urdf", ".xml"])
-def test_bad_encodings_are_named_with_their_line(data, words, reader, suffix, tmp_path):
-    path = tmp_path / f"arm{suffix}"
-    path.write_bytes(data)
-    with pytest.raises(ValueError, match="arm") as caught:
-        reader(path)
-    assert all(word in str(caught.value) for word in words) and f"{path}:" in str(caught.value)
+def test_bad_encodings_are_named_with_their_line(data, words, tmp_path):
+    for path in (tmp_path / "arm.urdf", tmp_path / "arm.xml"):
+        path.write_bytes(data)
+        for reader in (jd.load_model, jd.load, jd.pictures.shapes):
+            with pytest.raises(ValueError, match="arm") as caught:
+                reader(path)
+            assert all(word in str(caught.value) for word in (*words, f"{path}:"))
 
 
 @pytest.mark.parametrize("text", ["1_0", "１０", "0x10", "1,0", "nan", "inf", "1e999"])
 def test_numbers_that_only_python_reads_are_refused(text, urdf):
-    inertial = f'<inertial><mass value="{text}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-    path = urdf(link("a"), link("b", inertial), joint("j", "a", "b"))
+    path = urdf(link("a"), link("b", SOLID.replace('"1"', f'"{text}"', 1)), joint("j", "a", "b"))
     with pytest.raises(ValueError, match=f"value of <mass> of link 'b' is '{text}'; give a finite number"):
         jd.load_model(path)
 
 
 def test_warnings_point_at_the_line_of_the_caller(urdf):
-    heavy = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="5" ixy="0" ixz="0" iyz="0"/></inertial>'
+    heavy = SOLID.replace('izz="1"', 'izz="5"')
     limit = '<axis xyz="0 0 1"/><limit lower="-180" upper="180" effort="1" velocity="1"/>'
     closing = '<gazebo><joint name="g" type="screw"><parent>a</parent><child>b</child></joint></gazebo>'
     path = urdf(link("a"), link("b", heavy), joint("j", "a", "b", limit), closing)
@@ -724,6 +681,7 @@ def test_load_takes_every_robot_or_says_how(name):
         if "lock=[" in str(refusal.value):
             names = str(refusal.value).split("lock=[")[1].split("]")[0].replace("'", "").split(", ")
             assert not set(names) & set(jd.load(path, lock=names).system.joint_names)
+            assert_same_as_pinocchio(jd.load_model(path, lock=names), locked_in_pinocchio(in_pinocchio(name), names))
         elif "mimic=" in str(refusal.value):
             assert jd.load(path, mimic="ignore").system.nb > 0
 

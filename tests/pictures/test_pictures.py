@@ -1,7 +1,10 @@
 """Pictures: solids of files and of inertias, drawings, pages for a browser."""
 
+import base64
+import re
 import shutil
 import subprocess
+import urllib.request
 from pathlib import Path
 
 import jax
@@ -9,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image
 
 import jaxdyn as jd
 from jaxdyn.model import host_math
@@ -62,17 +66,18 @@ def test_simplified_meshes_are_small_and_close():
     assert simplify(vertices, faces, 10_000)[0] is vertices
 
 
+def solids_of(scene, given=()) -> jd.pictures.Shapes:
+    """Solids that are drawn: those that are given, and of inertias where a body has none."""
+    return default_solids.complete_solids(scene, jd.pictures.Shapes(given))
+
+
 @pytest.mark.parametrize("moments", [(0.01, 0.02, 0.025), (0.02, 0.02, 0.03), (0.02, 0.02, 0.005), (0.02, 0.02, 0.02)])
 def test_solids_of_inertia_have_that_inertia(moments):
     turn = host_math.rotation_from_rpy((0.3, -0.4, 0.9))
     com, mass = np.array([0.1, 0.05, -0.02]), 2.0
     inertia = (mass, com, turn @ np.diag(moments) @ turn.T)
     model = jd.ModelBuilder("one").add_body("body", joint="spherical", inertia=inertia).build()
-    (solid,) = [
-        shape
-        for shape in default_solids.complete_solids(jd.Scene(model), jd.pictures.Shapes())
-        if shape.kind != "capsule"
-    ]
+    (solid,) = [shape for shape in solids_of(jd.Scene(model)) if shape.kind != "capsule"]
     vertices, faces = solid.triangles()
     computed = inertia_of(vertices - com, faces, mass)
     # Round solids are polygons of 24 sides.
@@ -88,7 +93,7 @@ def test_every_scene_of_bodies_has_solids_and_a_stage():
     with_bodies = {name: scene for name, scene in built.items() if isinstance(scene.system, jd.Model)}
     assert len(with_bodies) > 20
     for name, scene in with_bodies.items():
-        shapes = default_solids.complete_solids(scene, jd.pictures.Shapes())
+        shapes = solids_of(scene)
         assert shapes and shapes.frames() <= set(scene.system.frame_names), name
         for shape in shapes:
             assert volume(*shape.triangles()) > 0, name
@@ -147,14 +152,13 @@ def test_solids_of_urdf(urdf, solids):
     assert volume(*mesh.triangles()) == pytest.approx(8 / 6, rel=1e-12)  # twice as large as in its file
     np.testing.assert_allclose(box.pose[:3, :3], host_math.rotation_from_rpy((0, 0, 0.3)))
     # The lower arm has the tip's ball; nothing of inertia is added to bodies that have a solid.
-    model = jd.load_model(urdf)
-    assert {shape.source for shape in default_solids.complete_solids(jd.Scene(model), solids)} == {"file"}
-    whole = default_solids.complete_solids(jd.Scene(model), jd.pictures.Shapes([box]))
-    assert [shape.frame for shape in whole if shape.source == "inertia"] == ["lower"]
+    scene = jd.Scene(jd.load_model(urdf))
+    assert {shape.source for shape in solids_of(scene, solids)} == {"file"}
+    assert [shape.frame for shape in solids_of(scene, [box]) if shape.source == "inertia"] == ["lower"]
 
 
 def test_solids_of_mjcf(tmp_path):
-    mujoco = pytest.importorskip("mujoco")
+    pytest.importorskip("mujoco")
     path = tmp_path / "robot.xml"
     path.write_text("""<mujoco><asset><material name="blue" rgba="0 0 1 1"/>
       <mesh name="part" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/><mesh name="lost" file="lost.stl"/></asset><worldbody>
@@ -171,7 +175,6 @@ def test_solids_of_mjcf(tmp_path):
     # mujoco moves a mesh to its centre and turns it to its axes of inertia, and the geom with it.
     vertices = solids[2].triangles()[0]
     np.testing.assert_allclose(vertices.min(0), (0.1, 0.2, 0.3), atol=1e-6)  # of float32
-    assert mujoco is not None
 
 
 def test_solids_of_sdf(tmp_path):
@@ -192,19 +195,13 @@ def test_solids_of_sdf(tmp_path):
 
 def test_shapes_refuse_what_they_cannot_read(tmp_path):
     path = tmp_path / "robot.urdf"
-    path.write_text(
-        "<robot name='r'><link name='a'><visual><geometry>\n<box size='1 2'/></geometry></visual></link></robot>"
-    )
-    with pytest.raises(ValueError, match=r"robot\.urdf:2: size .*give 3"):
-        jd.pictures.shapes(path)
-    path.write_text("<html/>")
-    with pytest.raises(ValueError, match="expected <robot>"):
-        jd.pictures.shapes(path)
-    path.write_bytes(b"solid")
+    text = "<robot name='r'><link name='a'><visual><geometry>\n{}</geometry></visual></link></robot>"
+    for content, words in ((text.format("<box size='1 2'/>"), r":2: size .*give 3"), ("<html/>", "expected <robot>")):
+        path.write_text(content)
+        with pytest.raises(ValueError, match=rf"robot\.urdf.*{words}"):
+            jd.pictures.shapes(path)
     (tmp_path / "broken.stl").write_bytes(b"no mesh")
-    path.write_text(
-        "<robot name='r'><link name='a'><visual><geometry><mesh filename='broken.stl'/></geometry></visual></link></robot>"
-    )
+    path.write_text(text.format("<mesh filename='broken.stl'/>"))
     with pytest.warns(jd.io.NotTakenWarning, match=r"broken\.stl"):
         assert jd.pictures.shapes(path) == ()
 
@@ -247,11 +244,9 @@ def test_marks_and_forces_of_a_loop(turning):
     computed = []
     for sign in (1.0, -1.0):
         poses = motion.poses_of(scene.system, (np.asarray(solution.q[0, 0]) + sign * dq)[None])
-        places = [
-            default_solids.frame_poses(scene.system, poses, body) @ np.asarray(pose)
-            for body, pose in scene.constraints[0].ends()
-        ]
-        computed.append(places[1][0, :3, 3] - places[0][0, :3, 3])
+        ends = scene.constraints[0].ends()
+        first, second = (default_solids.frame_poses(scene.system, poses, body) @ np.asarray(at) for body, at in ends)
+        computed.append((second - first)[0, :3, 3])
     work = force.vectors[0, 0] @ (computed[0] - computed[1]) / 2
     # A central difference over a step of 1e-6; the start closes the loop to rounding.
     assert work == pytest.approx(float(np.asarray(solution.multipliers[0, 0]) @ rows @ dq), rel=1e-6)
@@ -286,12 +281,9 @@ def test_each_kind_of_force_has_a_scale_of_its_own():
     def force(kind, size):
         return motion.Force(kind, kind, np.zeros((1, 1, 3)), np.array([[[size, 0.0, 0.0]]]))
 
-    drawn = scale_forces(
-        [force("normal", 1e3), force("friction", 1.0), force("bearing", 4.0), force("bearing", 2.0)], 0.5
-    )
-    assert [(f.kind, f.vectors[0, 0, 0] * scale) for f, scale in drawn] == [
-        ("normal", 0.5), ("friction", 0.5), ("bearing", 0.5), ("bearing", 0.25),
-    ]  # fmt: skip
+    sizes = ("normal", 1e3), ("friction", 1.0), ("bearing", 4.0), ("bearing", 2.0)
+    drawn = [(f.kind, f.vectors[0, 0, 0] * scale) for f, scale in scale_forces([force(*x) for x in sizes], 0.5)]
+    assert drawn == [("normal", 0.5), ("friction", 0.5), ("bearing", 0.5), ("bearing", 0.25)]
 
 
 def test_marks_of_turning_solids_are_their_whole_surface():
@@ -303,19 +295,13 @@ def test_marks_of_turning_solids_are_their_whole_surface():
         areas = []
         for part in (dark, light):
             vertices, faces = part.triangles()
-            sides = vertices[faces]
-            areas.append(
-                np.linalg.norm(np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0]), axis=1).sum() / 2
-            )
+            a, b, c = (vertices[faces[:, k]] for k in range(3))
+            areas.append(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
         assert areas[0] == pytest.approx(areas[1], rel=1e-9)
         assert len(dark.faces) + len(light.faces) == len(solid.triangles()[1])
     # A solid of a file keeps its colours, and a mark of a point is without an attitude.
-    kept = jd.pictures.Shapes(
-        [
-            jd.pictures.Shape("coin", "ellipsoid", (0.5,) * 3),
-            jd.pictures.Shape("coin", "ellipsoid", (0.01,) * 3, source="mark"),
-        ]
-    )
+    marks = ((0.5, {}), (0.01, {"source": "mark"}))
+    kept = jd.pictures.Shapes([jd.pictures.Shape("coin", "ellipsoid", (size,) * 3, **more) for size, more in marks])
     assert stage.paint_sectors(kept, model) == kept
 
 
@@ -325,8 +311,7 @@ def test_a_link_with_three_joints_is_a_plate():
     builder = jd.ModelBuilder("links").add_body("link", inertia=(1.0, (0.3, 0.2, 0.0), (0.1, 0.1, 0.2)))
     for name, place in zip("ab", corners[1:], strict=True):
         builder.add_body(name, "link", inertia=(1.0, (0.2, 0.0, 0.0), (0.1, 0.1, 0.1)), pose=tuple(place))
-    solids = default_solids.complete_solids(jd.Scene(builder.build()), jd.pictures.Shapes())
-    (plate,) = [solid for solid in solids if solid.frame == "link" and solid.kind == "mesh"]
+    (plate,) = [x for x in solids_of(jd.Scene(builder.build())) if x.frame == "link" and x.kind == "mesh"]
     vertices, faces = plate.triangles()
     assert volume(vertices, faces) == pytest.approx(0.25 * np.ptp(vertices[:, 2]), rel=1e-9)
 
@@ -385,11 +370,7 @@ def test_what_a_hand_holds_is_seen_through_and_has_its_shape():
     """A ball with contacts on its surface, a cube of the same three moments, a bar between two contacts."""
     shapes = {}
     for name, held in (("hand_with_ball", "ball"), ("allegro_with_cube", "cube"), ("hand_with_bar", "bar")):
-        shapes[name] = [
-            s
-            for s in default_solids.complete_solids(getattr(jd.scenes, name)(), jd.pictures.Shapes())
-            if s.frame == held
-        ]
+        shapes[name] = [shape for shape in solids_of(getattr(jd.scenes, name)()) if shape.frame == held]
     (ball,), (cube,) = shapes["hand_with_ball"], shapes["allegro_with_cube"]
     assert ball.kind == "ellipsoid" and ball.size == pytest.approx((0.1,) * 3) and 0 < ball.opacity < 0.5
     assert cube.kind == "box" and cube.size == pytest.approx((0.06,) * 3) and 0 < cube.opacity < 0.5
@@ -414,17 +395,13 @@ def test_forces_are_drawn_where_they_are_given(tmp_path):
 
 @pytest.mark.long
 def test_draw_and_animate(turning, solids, urdf, tmp_path):
-    pytest.importorskip("matplotlib")
     scene, solution = turning
     axes = jd.draw(scene, solution.q[0, 0])
     assert axes.name == "3d" and axes.get_xlabel() == "x (m)"
     axes.figure.savefig(tmp_path / "one.png")
     assert (tmp_path / "one.png").stat().st_size > 5_000
-    jd.animate(
-        scene, solution, tmp_path / "turn.gif", fps=10, frames=("rocker",), points={"P": ("coupler", (1.0, 0.0, 0.0))}
-    )
-    from PIL import Image
-
+    options = {"fps": 10, "frames": ("rocker",), "points": {"P": ("coupler", (1.0, 0.0, 0.0))}}
+    jd.animate(scene, solution, tmp_path / "turn.gif", **options)
     with Image.open(tmp_path / "turn.gif") as picture:
         assert picture.n_frames == 5  # of 0.4 s
     jd.draw(jd.load_model(urdf), jnp.asarray([0.3, -0.2]), axes, shapes=solids)
@@ -443,9 +420,7 @@ REFUSED = {
     "is the scene that of the solution": lambda _, turn, __: motion.motion_of(jd.scenes.windows(), turn),
     r"write to a file \.html": lambda scene, turn, folder: jd.pictures.save_html(folder / "turn.txt", scene, turn),
     "there is no directory": lambda scene, turn, folder: jd.pictures.save_html(folder / "no" / "a.html", scene, turn),
-    "LagrangianSystem, which has no bodies": lambda _, __, folder: jd.pictures.save_html(
-        folder / "turn.html", jd.scenes.pendulum(), jnp.zeros(1)
-    ),
+    "which has no bodies": lambda _, __, folder: jd.pictures.save_html(folder / "a.html", jd.scenes.pendulum(), [0.0]),
     "port is 70000; give a number": lambda scene, turn, _: jd.view(scene, turn, port=70000),
 }
 
@@ -483,9 +458,6 @@ def page(turning, tmp_path_factory) -> Path:
 
 def messages_of(path: Path) -> list[tuple[float, dict]]:
     """What a page holds: times and messages of its recording."""
-    import base64
-    import re
-
     import msgspec
     import zstandard
 
@@ -516,9 +488,6 @@ def test_page_is_one_small_file_with_the_whole_motion(page, turning, capsys):
 
 def test_view_serves_a_page_on_this_machine(turning, monkeypatch, capsys):
     pytest.importorskip("viser")
-    import re
-    import urllib.request
-
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
         monkeypatch.delenv(name, raising=False)
     scene, solution = turning
@@ -552,8 +521,6 @@ def test_page_shows_the_mechanism_in_a_browser(page, tmp_path):
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no Chromium on this machine")
-    from PIL import Image
-
     flags = (
         "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
         "--disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=800,600 --virtual-time-budget=15000"
@@ -586,9 +553,8 @@ def test_bodies_with_a_slash_in_their_names_are_where_they_are(monkeypatch):
             for step in handles[name].name.strip("/").split("/"):
                 path += f"/{step}"
                 if (handle := node(path)) is not None:
-                    placed = placed @ host_math.joint_pose(
-                        "free", np.zeros(6), np.concatenate([handle.position, handle.wxyz])
-                    )
+                    q_of_node = np.concatenate([handle.position, handle.wxyz])
+                    placed = placed @ host_math.joint_pose("free", np.zeros(6), q_of_node)
             np.testing.assert_allclose(placed, jd.frame_pose(model, q, name), atol=1e-6)  # viser sends float32
             assert sum(handle.name == handles[name].name for handle in handles.values()) == 1
     finally:
@@ -606,14 +572,12 @@ def red_box(model):
 @pytest.mark.long
 def test_speed_and_shapes_of_an_animation(tmp_path):
     """Two seconds of motion at twice the speed and five frames a second are six frames; a red box is red."""
-    pytest.importorskip("matplotlib")
-    image = pytest.importorskip("PIL.Image")
     model = jd.robots.chain(2)
     motion = jd.simulate(model, jnp.ones(2), jnp.zeros(2), jnp.linspace(0.0, 2.0, 21))
     reds = []
     for shapes in (None, red_box(model)):
         jd.animate(model, motion, tmp_path / "a.gif", fps=5, speed=2.0, shapes=shapes)
-        with image.open(tmp_path / "a.gif") as picture:
+        with Image.open(tmp_path / "a.gif") as picture:
             assert picture.n_frames == 6
             pixels = np.asarray(picture.convert("RGB"), int)
         reds.append(int(np.sum((pixels[..., 0] > 120) & (pixels[..., 1:].max(axis=2) < 60))))

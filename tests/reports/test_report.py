@@ -18,25 +18,10 @@ from benchmarks.report_cases import cases
 from benchmarks.report_cases.references import car_axis, rolling_down, sliding_block
 from jaxdyn.cli import main
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.reports import Record, Report, html_page, pareto_front
+from jaxdyn.reports import Record, Report, html_page, pareto_front, references
 from jaxdyn.reports import run as running
 from jaxdyn.reports.plotting import SceneReference
 from jaxdyn.reports.programs import FIXED, SOLVERS, Case, Programs, Reference, case_of_scene, prepare
-from jaxdyn.reports.references import (
-    CLOSED_FORMS,
-    coin,
-    falling_table,
-    free_top,
-    integral,
-    plane_pendulum,
-    projectile,
-    skate,
-    sleigh,
-    sphere_pendulum,
-    swing,
-    turntable,
-    windows,
-)
 from jaxdyn.reports.run import Contestant, Motion, evaluations, ladder, measure, time_alternately
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.solvers.choice import choose_solver
@@ -90,24 +75,30 @@ def test_the_report_knows_every_scene():
 
 # Of closed forms: times, and the rates of a state by the equations of motion as a textbook has them, from q[0] and v[0].
 EQUATIONS = {
-    "swing": (swing, lambda q, v: [*v, -9.81 * np.sin(q[0])]),
-    "thrown": (projectile, lambda q, v: [*v, 0.0, -9.81]),
+    "swing": (references.swing, lambda q, v: [*v, -9.81 * np.sin(q[0])]),
+    "thrown": (references.projectile, lambda q, v: [*v, 0.0, -9.81]),
     "braked": (sliding_block, lambda q, v: [*v, -0.3 * 9.81]),
     # The pull of the slope along the blade; what is across it the blade takes.
-    "skate": (skate, lambda q, v: [v[0] * np.cos(q[2]), v[0] * np.sin(q[2]), v[2], 9.81 / 2 * np.cos(q[2]), 0.0, 0.0]),
+    "skate": (
+        references.skate,
+        lambda q, v: [v[0] * np.cos(q[2]), v[0] * np.sin(q[2]), v[2], 9.81 / 2 * np.cos(q[2]), 0.0, 0.0],
+    ),
 }
+
+
+def solved_by_scipy(rates, start, ts):
+    """States (len(ts), n) by DOP853."""
+    return solve_ivp(rates, (0, ts[-1]), start, "DOP853", ts, rtol=1e-12, atol=1e-14).y.T
 
 
 @pytest.mark.parametrize("name", EQUATIONS)
 def test_closed_forms_solve_the_equations(name):
-    """By scipy's DOP853."""
     form, rates = EQUATIONS[name]
     ts = np.linspace(0.0, 0.6, 4)
     computed = form(ts)
-    n = computed.q.shape[1]
-    start = np.concatenate([computed.q[0], computed.v[0]])
-    solved = solve_ivp(lambda t, y: rates(y[:n], y[n:]), (0, 0.6), start, "DOP853", ts, rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(np.concatenate([computed.q, computed.v], 1), solved.y.T, atol=1e-10)
+    n, states = computed.q.shape[1], np.concatenate([computed.q, computed.v], 1)
+    solved = solved_by_scipy(lambda t, y: rates(y[:n], y[n:]), states[0], ts)
+    np.testing.assert_allclose(states, solved, atol=1e-10)
 
 
 def test_turning_closed_forms_solve_the_equations():
@@ -115,25 +106,20 @@ def test_turning_closed_forms_solve_the_equations():
     ts = np.linspace(0.0, 1.0, 6)
     computed, pull = rolling_down(ts), 5 / 14 * 9.81
     turned = Rotation.from_quat(np.roll(computed.q[:, 3:], -1, 1))
-    np.testing.assert_allclose(
-        turned.as_rotvec()[1], [0.0, (0.5 * ts[1] + pull * ts[1] ** 2 / 2) / 0.1, 0.0], atol=1e-13
-    )
+    angle = (0.5 * ts[1] + pull * ts[1] ** 2 / 2) / 0.1
+    np.testing.assert_allclose(turned.as_rotvec()[1], [0.0, angle, 0.0], atol=1e-13)
     np.testing.assert_allclose(turned.apply(computed.v[:, :3]), np.outer(0.5 + pull * ts, [1, 0, 0]), atol=1e-13)
     np.testing.assert_allclose(computed.v[:, 4] * 0.1, 0.5 + pull * ts, atol=1e-14)
-    computed, r = falling_table(ts), 0.145
+    computed, r = references.falling_table(ts), 0.145
     moment = 20 * (1 + 0.05**2) / 12 + (0.2**2 + 0.24**2) / 12 + r**2
-    start = [computed.q[0, 7], 0.0]
-    solved = solve_ivp(
-        lambda t, y: [y[1], 9.81 * r * np.sin(y[0]) / moment], (0, 1), start, "DOP853", ts, rtol=1e-12, atol=1e-14
-    )
-    np.testing.assert_allclose(computed.q[:, 7], solved.y[0], atol=1e-11)
-    np.testing.assert_allclose(computed.v[:, 6], solved.y[1], atol=1e-11)
+    solved = solved_by_scipy(lambda t, y: [y[1], 9.81 * r * np.sin(y[0]) / moment], [computed.q[0, 7], 0.0], ts)
+    np.testing.assert_allclose(computed.q[:, 7], solved[:, 0], atol=1e-11)
+    np.testing.assert_allclose(computed.v[:, 6], solved[:, 1], atol=1e-11)
     turned = Rotation.from_quat(np.roll(computed.q[:, 3:7], -1, 1))
     np.testing.assert_allclose(turned.as_rotvec(), np.outer(computed.q[:, 7], [0, 1, 0]), atol=1e-13)
     np.testing.assert_allclose(computed.q[:, :3], turned.apply([0, 0, r]), atol=1e-13)
-    np.testing.assert_allclose(
-        turned.apply(computed.v[:, :3]), np.cross(computed.v[:, 6:] * [0, 1, 0], computed.q[:, :3]), atol=1e-13
-    )
+    velocity = np.cross(computed.v[:, 6:] * [0, 1, 0], computed.q[:, :3])
+    np.testing.assert_allclose(turned.apply(computed.v[:, :3]), velocity, atol=1e-13)
 
 
 def test_plane_pendulum_has_the_printed_digits():
@@ -146,7 +132,7 @@ def test_plane_pendulum_has_the_printed_digits():
         (-0.316436469913032291, -0.948613704575776519),
         (-0.27508746257611686, -0.961419205099125064),
     ]
-    computed = plane_pendulum(ts)
+    computed = references.plane_pendulum(ts)
     np.testing.assert_allclose(computed.q, want, atol=1e-13)
     energy = 0.5 * np.sum(computed.v**2, 1) + 9.81 * computed.q[:, 1]
     np.testing.assert_allclose(energy, 0.0, atol=1e-13)
@@ -166,13 +152,13 @@ def test_free_top_has_the_printed_rates_and_turns_as_they_say():
         return np.concatenate([(turned @ np.cross(np.eye(3), w)).ravel(), np.cross(MOMENTS * w, w) / MOMENTS])
 
     for start, end in printed.items():
-        computed = free_top(ts, start=start)
+        computed = references.free_top(ts, start=start)
         np.testing.assert_allclose(computed.v[-1], end, atol=1e-12)
         turned = Rotation.from_quat(np.roll(computed.q, -1, 1)).as_matrix()
         momentum = np.einsum("tij,tj->ti", turned, MOMENTS * computed.v)
         np.testing.assert_allclose(momentum, np.tile(MOMENTS * start, (6, 1)), atol=1e-12)
-        solved = solve_ivp(rate, (0, 20), [*np.eye(3).ravel(), *start], "DOP853", ts, rtol=1e-12, atol=1e-13)
-        np.testing.assert_allclose(turned.reshape(6, 9), solved.y[:9].T, atol=1e-9)
+        solved = solved_by_scipy(rate, [*np.eye(3).ravel(), *start], ts)
+        np.testing.assert_allclose(turned.reshape(6, 9), solved[:, :9], atol=1e-9)
 
 
 def test_sphere_pendulum_against_angles():
@@ -186,8 +172,8 @@ def test_sphere_pendulum_against_angles():
 
     for turn in (1.0, 4.5):  # the start is the highest, then the lowest point
         h = np.sin(1.0) ** 2 * turn
-        computed = sphere_pendulum(ts, turn=turn)
-        theta, _, phi = solve_ivp(rate, (0, 10), [1.0, 0.0, 0.0], "DOP853", ts, rtol=1e-12, atol=1e-13).y
+        computed = references.sphere_pendulum(ts, turn=turn)
+        theta, _, phi = solved_by_scipy(rate, [1.0, 0.0, 0.0], ts).T
         want = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), -np.cos(theta)], 1)
         np.testing.assert_allclose(computed.q, want, atol=1e-9)
         np.testing.assert_allclose(np.cross(computed.q, computed.v)[:, 2], h, atol=1e-12)
@@ -206,7 +192,7 @@ def test_sphere_pendulum_against_angles():
 )
 def test_windows_have_the_printed_digits(count, t, place, velocity):
     """Problem A02: place and velocity of the first top, 8 digits; and energy."""
-    computed = windows(np.array([0.0, t]), count)
+    computed = references.windows(np.array([0.0, t]), count)
     angle, turn = -computed.q[-1, 0], -computed.v[-1, 0]
     top = np.array([np.sin(angle), np.cos(angle)])
     np.testing.assert_allclose(top, place, atol=2e-8)
@@ -217,29 +203,25 @@ def test_windows_have_the_printed_digits(count, t, place, velocity):
 
 def test_sleigh_and_coin_have_the_printed_digits():
     """Problems 3.4 and 3.10, where integrals and one turn of the circle are printed."""
-    computed = sleigh(np.array([0.0, 1.0, 10.0]))
-    want = [
-        (0.3134115046418, 0.3477380366348, 1.356093732499),
-        (-8.600842105481, -0.4306517115655, 3.570508149338),
-    ]
+    computed = references.sleigh(np.array([0.0, 1.0, 10.0]))
+    want = [(0.3134115046418, 0.3477380366348, 1.356093732499), (-8.600842105481, -0.4306517115655, 3.570508149338)]
     np.testing.assert_allclose(computed.q[1:], want, atol=2e-12)
     np.testing.assert_allclose(computed.v[1:, 0], (0.7547057324456, 1.169390226108), atol=1e-12)
     np.testing.assert_allclose(computed.v[1:, 2], (1.162929714574, 0.00670176830728), atol=1e-12)
 
     period = 5.852173782956319
-    computed = coin(np.array([0.0, period / 4, period]))
-    np.testing.assert_allclose(
-        computed.q[[0, 2], :3], np.tile([0.0, 0.4956422128626671, computed.q[0, 2]], (2, 1)), atol=1e-12
-    )
-    np.testing.assert_allclose(np.hypot(*computed.q[:, :2].T), 0.4956422128626671, atol=1e-14)
+    computed = references.coin(np.array([0.0, period / 4, period]))
+    radius = 0.4956422128626671
+    np.testing.assert_allclose(computed.q[[0, 2], :3], [[0.0, radius, computed.q[0, 2]]] * 2, atol=1e-12)
+    np.testing.assert_allclose(np.hypot(*computed.q[:, :2].T), radius, atol=1e-14)
 
 
 def test_integral_knows_its_error():
     ts = np.array([0.0, 1.0, 4.0])
-    computed, error = integral(np.cos, ts, 1.0)
+    computed, error = references.integral(np.cos, ts, 1.0)
     np.testing.assert_allclose(computed, np.sin(ts), atol=1e-15)
     assert error < 1e-15
-    computed, error = integral(lambda t: np.exp(-((6 * (t - 2)) ** 2)), ts, 4.0)  # too long for this one
+    computed, error = references.integral(lambda t: np.exp(-((6 * (t - 2)) ** 2)), ts, 4.0)  # too long for this one
     assert 0.1 * abs(computed[-1] - np.sqrt(np.pi) / 6) < error < 1e-2
 
 
@@ -295,13 +277,17 @@ def rungs(body):
     return ladder(body, "free", "Tsit5", [1e-4, 1e-7], "float64", body.programs.batch_starts(1))
 
 
+def contestant(motion):
+    """A peer with a motion that is known."""
+    return Contestant("peer", "by hand", "exact", 1.0, True, lambda: None, lambda _: motion)
+
+
 @pytest.fixture(scope="module")
 def records(body, rungs):
     """Two rungs of a ladder, a peer that is exact and one that failed."""
     exact = Motion(body.reference.q, body.reference.v)
     failed = Motion(np.nan * exact.q, np.nan * exact.v, "max_steps_reached")
-    peers = [Contestant("peer", "by hand", "exact", 1.0, True, lambda: None, lambda _, m=m: m) for m in (exact, failed)]
-    return measure(body, [*rungs, *peers], "float64", 1, rounds=2)
+    return measure(body, [*rungs, contestant(exact), contestant(failed)], "float64", 1, rounds=2)
 
 
 def test_records_hold_what_a_motion_says(body, rungs, records):
@@ -343,7 +329,7 @@ def test_batches_start_along_the_motion(body):
     q, v, ts = body.programs.batch_starts(25)
     assert np.ptp(ts - body.reference.ts, axis=1).max() < 1e-14
     np.testing.assert_allclose(ts[:, 0], 2.0 * np.arange(25) / 25)
-    want = free_top(ts[:, 0])
+    want = references.free_top(ts[:, 0])
     turned = [Rotation.from_quat(np.roll(x, -1, 1)).as_matrix() for x in (q, want.q)]
     np.testing.assert_allclose(turned[0], turned[1], atol=1e-10)
     np.testing.assert_allclose(v, want.v, atol=1e-10)
@@ -425,10 +411,7 @@ def test_report_writes(small, body, rungs, tmp_path):
     for words in ("Free rigid body", "time per trajectory", "energy error", "free, Tsit5"):
         assert words in page
     assert measured.head["machine"]["device"] in page
-
-    peer = Contestant(
-        "peer", "by hand", "exact", 1.0, True, lambda: None, lambda _: Motion(body.reference.q, body.reference.v)
-    )
+    peer = contestant(Motion(body.reference.q, body.reference.v))
     with_peers = jd.report("free_body", rounds=1, peers=lambda *_: [peer])
     assert {r.source for r in with_peers.records} == {"jaxdyn", "peer"}
 
@@ -462,21 +445,19 @@ def test_a_scene_of_ones_own(rungs, monkeypatch):
     monkeypatch.setattr(running, "settings", lambda *args, **options: [1e-4, 1e-9])
     model, ts = jd.robots.chain(1), np.linspace(0.0, 0.5, 3)
     case = Case("mine", "A pendulum of mine", lambda: (jd.Scene(model), (np.array([0.4]), np.zeros(1))), None, ts, 20)
-    measured = jd.report(case, rounds=1, integrators=[("free", "Dopri8")])
+    compare = functools.partial(jd.report, rounds=1, integrators=[("free", "Dopri8")])
+    measured = compare(case)
     coarse, fine = (record.error_path for record in measured.records)
     fine_setting = measured.records[1].setting
     assert fine < 1e-8 < coarse < 1e-2
-    several = jd.report(case, rounds=1, integrators=[("free", "Dopri8")], dtypes=("float32", "float64"), batches=(1, 3))
+    several = compare(case, dtypes=("float32", "float64"), batches=(1, 3))
     found = {(record.dtype, record.batch, record.solver) for record in several.records}
     assert found == {(dtype, batch, "Dopri8") for dtype in ("float32", "float64") for batch in (1, 3)}
     # The fine rung in float64 is that of before; float32 has its rounding.
     errors = {(r.dtype, r.batch): r.error_path for r in several.records if r.setting == fine_setting}
     assert errors["float64", 3] == pytest.approx(fine, rel=0.5) and errors["float32", 1] > 1e-8
-    off = case._replace(
-        reference=lambda start: Reference(ts, np.full((3, 1), 0.4), np.zeros((3, 1)), "wrong", "a guess")
-    )
-    measured = jd.report(off, rounds=1, integrators=[("free", "Dopri8")])
-    assert all(record.error_path > 0.1 for record in measured.records)
+    wrong = Reference(ts, np.full((3, 1), 0.4), np.zeros((3, 1)), "wrong", "a guess")
+    assert all(record.error_path > 0.1 for record in compare(case._replace(reference=lambda start: wrong)).records)
 
 
 def test_a_page_without_matplotlib_is_refused_before_the_runs(small, tmp_path, monkeypatch):
@@ -505,14 +486,12 @@ def test_page_escapes():
     """Failures without a plot, names that are no HTML."""
     head = {"machine": {"processor": "<cpu>", "cores": 1, "device": "cpu", "load": 0.0, "versions": {}}}
     head |= {"date": "today"}
-    known = SceneReference("One & only", "printed", "x", 1e-9)
-    report = Report(
-        head, {"one": known}, (made(1e-3, 1.0), made(0.0, 2.0, evaluations=10), made(None, 1.0, result="bad"))
-    )
+    known, bad = SceneReference("One & only", "printed", "x", 1e-9), made(None, 1.0, result="bad")
+    report = Report(head, {"one": known}, (made(1e-3, 1.0), made(0.0, 2.0, evaluations=10), bad))
     page = html_page(report)
     assert "&lt;cpu&gt;" in page
     assert "One &amp; only" in page
-    failed = dataclasses.replace(report, records=(made(None, 1.0, result="bad"),))
+    failed = dataclasses.replace(report, records=(bad,))
     assert "No run succeeded" in html_page(failed)
 
 
@@ -532,7 +511,7 @@ def test_printed_ends_are_as_printed():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CLOSED_FORMS)
+@pytest.mark.parametrize("name", references.CLOSED_FORMS)
 def test_a_named_scene_is_compared_with_its_closed_form(name):
     """Which a run of the library follows from the scene's default start for a second."""
     prepared = prepare(case_of_scene(name))
@@ -543,7 +522,7 @@ def test_a_named_scene_is_compared_with_its_closed_form(name):
 def test_ball_on_a_turntable_in_closed_form_rolls():
     """Its velocity at the contact is the table's; the rate of its quaternion is that of its angular velocity, by differences."""
     ts = np.linspace(0.0, 1.0, 2001)
-    known = turntable(ts)
+    known = references.turntable(ts)
     turned = Rotation.from_quat(np.roll(known.q[:, 4:], -1, 1))
     spin, place = turned.apply(known.v[:, 4:]), known.q[:, 1:4] * [1, 1, 0]
     at_contact = turned.apply(known.v[:, 1:4]) + np.cross(spin, [0.0, 0.0, -0.2])

@@ -22,10 +22,13 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
+from jaxdyn.cli import main
 from jaxdyn.scale import program
 from jaxdyn.scale import store as stores
 from jaxdyn.scale.program import members
+from jaxdyn.scale.reductions import Reducer, Totals
 from jaxdyn.scale.store import lock_store
+from jaxdyn.scale.study import Summary
 
 zarr = pytest.importorskip("zarr", reason="zarr is not installed: the extra scale")
 xarray = pytest.importorskip("xarray", reason="xarray is not installed: the extra scale")
@@ -45,9 +48,14 @@ def drawn(key):
 
 def evaluated(out, samples=23, function=square, parameters=drawn, **options):
     own = {"chunk": 5, "progress": False} | {name: options.pop(name) for name in OF_RESOURCES if name in options}
-    return jd.scale.evaluate(
-        function, parameters, samples=samples, out=out, resources=jd.scale.Resources(**own), **options
-    )
+    options |= {"samples": samples, "out": out, "resources": jd.scale.Resources(**own)}
+    return jd.scale.evaluate(function, parameters, **options)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run to its end, which nothing changes."""
+    return evaluated(tmp_path_factory.mktemp("scale") / "whole.zarr")
 
 
 def files(path):
@@ -68,10 +76,8 @@ def assert_equal(one, other):
     for name, values in one.items():
         assert values.dtype == other[name].dtype, name
         # Bytes of objects, such as names, are addresses.
-        same = (
-            np.array_equal(values, other[name]) if values.dtype == object else values.tobytes() == other[name].tobytes()
-        )
-        assert same, name
+        ours, theirs = (x.tolist() if x.dtype == object else x.tobytes() for x in (values, other[name]))
+        assert ours == theirs, name
 
 
 @pytest.fixture(scope="module")
@@ -87,18 +93,10 @@ def pendulums(tmp_path_factory):
             jd.scenes.double_pendulum().system, forces=(jd.forces.JointDamping(jnp.stack([p["damping"]] * 2)),)
         )
 
-    def again():
-        return jd.scale.run(
-            build,
-            (starts, np.zeros(2)),
-            {"damping": lengths},
-            ts,
-            out=out,
-            stepsize=0.01,
-            outputs=("energy",),
-            units={"damping": "N m s"},
-            resources=jd.scale.Resources(chunk=8, progress=False),
-        )
+    def again(out=out, **resources):
+        resources = jd.scale.Resources(**{"chunk": 8, "progress": False} | resources)
+        options = {"stepsize": 0.01, "outputs": ("energy",), "units": {"damping": "N m s"}, "resources": resources}
+        return jd.scale.run(build, (starts, np.zeros(2)), {"damping": lengths}, ts, out=out, **options)
 
     return again(), build, starts, lengths, ts, again
 
@@ -109,9 +107,8 @@ def test_rows_are_those_of_simulate_with_names_and_units(pendulums):
     assert run.success and run.codes == {"successful": 21} and run.computed == 21
 
     def one(q, c):
-        solution = jd.simulate(
-            build({"damping": c}), q, jnp.zeros(2), ts, stepsize=0.01, outputs=("energy",), throw=False
-        )
+        options = {"stepsize": 0.01, "outputs": ("energy",), "throw": False}
+        solution = jd.simulate(build({"damping": c}), q, jnp.zeros(2), ts, **options)
         return solution.q, solution.v, solution.energy
 
     q, v, energy = jax.jit(jax.vmap(one))(starts, damping)
@@ -149,34 +146,23 @@ def test_arrays_without_entries_and_flags_are_stored(tmp_path):
     np.testing.assert_array_equal(table["count"], np.asarray(7 * table.parameter_x).astype(np.int32))
 
 
-def test_a_member_is_found_again(tmp_path):
-    run = evaluated(tmp_path / "a.zarr")
-    table = run.dataset()
+def test_a_member_is_found_again(whole):
+    table = whole.dataset()
     assert float(jd.scale.member(drawn, 17)["x"]) == float(table.parameter_x[17])
     assert float(jd.scale.member({"x": np.arange(3.0)}, 2)["x"]) == 2.0
     np.testing.assert_array_equal(table.y[:, 0], table.parameter_x**2)
 
 
 @pytest.mark.parametrize("options", [{"chunk": 7}, {"batch_size": 2}, {"devices": 1}, {"chunk": None}], ids=str)
-def test_rows_do_not_depend_on_how_they_are_computed(tmp_path, options):
-    want = arrays(evaluated(tmp_path / "a.zarr").out)
+def test_rows_do_not_depend_on_how_they_are_computed(whole, tmp_path, options):
     if "devices" in options:
         options = {"devices": jax.local_devices()[: options["devices"]]}
-    assert_equal(arrays(evaluated(tmp_path / "b.zarr", **options).out), want)
+    assert_equal(arrays(evaluated(tmp_path / "b.zarr", **options).out), arrays(whole.out))
 
 
 def test_motions_do_not_depend_on_devices_and_batches(pendulums, tmp_path):
-    run, build, starts, damping, ts, _ = pendulums
-    one_device = jd.scale.run(
-        build,
-        (starts, np.zeros(2)),
-        {"damping": damping},
-        ts,
-        out=tmp_path / "b.zarr",
-        stepsize=0.01,
-        outputs=("energy",),
-        resources=jd.scale.Resources(batch_size=5, devices=jax.local_devices()[:1], progress=False),
-    )
+    run, *_, again = pendulums
+    one_device = again(tmp_path / "b.zarr", chunk=None, batch_size=5, devices=jax.local_devices()[:1])
     assert_equal(arrays(one_device.out), arrays(run.out))
 
 
@@ -280,13 +266,11 @@ def slow_here(out):
 # Stores that are not what they should be
 
 
-def test_the_second_run_on_a_store_is_refused(tmp_path):
-    out = tmp_path / "a.zarr"
-    evaluated(out)
-    with lock_store(out):
+def test_the_second_run_on_a_store_is_refused(whole):
+    with lock_store(whole.out):
         with pytest.raises(ValueError, match=f"process {os.getpid()} of .* is writing"):
-            evaluated(out)
-    assert evaluated(out).computed == 0
+            evaluated(whole.out)
+    assert evaluated(whole.out).computed == 0
 
 
 @pytest.mark.parametrize(
@@ -324,9 +308,7 @@ def test_a_store_of_something_else_is_refused_with_what_differs(tmp_path, monkey
     refused("of another samples: there it is 23, here 24", samples=24)
     refused("of another rows stored", rows=["y"])
     refused("of another reductions", reductions={"y": jd.scale.Mean("y")})
-    refused(
-        "of another program of a rollout", function=lambda p: {"y": jnp.stack([p["x"] ** 3, p["x"]]), "z": 1.0 / p["x"]}
-    )
+    refused("another program of a rollout", function=lambda p: square(p) | {"y": jnp.stack([p["x"] ** 3, p["x"]])})
     refused("of another seed: there it is 3, here None", parameters=rows)
     evaluated(tmp_path / "b.zarr", parameters=rows)
     with pytest.raises(ValueError, match="of another values"):
@@ -360,7 +342,7 @@ def heavy(p):
     return {"y": jnp.full(2000, p["x"])}
 
 
-def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
+def test_a_full_disk_loses_nothing(whole, tmp_path, monkeypatch):
     """The run ends with an error that says so, and goes on where there is room again."""
     out, write = tmp_path / "a.zarr", stores.Store.write
 
@@ -375,7 +357,7 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
     assert caught.value.errno == errno.ENOSPC and recorded(out) == 3
     monkeypatch.undo()
     assert evaluated(out).computed == 23 - 3 * 5
-    assert files(out) == files(evaluated(tmp_path / "whole.zarr").out)
+    assert files(out) == files(whole.out)
 
 
 # Failures and reductions
@@ -384,16 +366,9 @@ def test_a_full_disk_loses_nothing(tmp_path, monkeypatch):
 def test_failures_are_rows_with_codes(tmp_path):
     speeds = np.ones((9, 2))
     speeds[[2, 7]] = np.nan
-    run = jd.scale.run(
-        jd.scenes.double_pendulum(),
-        (np.zeros(2), speeds),
-        None,
-        jnp.linspace(0.0, 0.1, 3),
-        out=tmp_path / "a.zarr",
-        stepsize=0.05,
-        reductions={"q": jd.scale.Mean("q")},
-        resources=jd.scale.Resources(chunk=4, progress=False),
-    )
+    options = {"stepsize": 0.05, "reductions": {"q": jd.scale.Mean("q")}, "out": tmp_path / "a.zarr"}
+    options |= {"resources": jd.scale.Resources(chunk=4, progress=False)}
+    run = jd.scale.run(jd.scenes.double_pendulum(), (np.zeros(2), speeds), None, jnp.linspace(0.0, 0.1, 3), **options)
     assert run.codes == {"successful": 7, "nonfinite_start": 2} and not run.success
     assert list(run.failed) == [2, 7] and "2 nonfinite_start" in str(run)
     table = run.dataset()
@@ -412,16 +387,10 @@ class Extent(jd.scale.Reduction):
     parts = ("least", "most")
 
     def partial(self, values, numbers):
-        return {
-            "least": np.min(values, axis=0, initial=np.inf),
-            "most": np.max(values, axis=0, initial=-np.inf),
-        }
+        return {"least": np.min(values, 0, initial=np.inf), "most": np.max(values, 0, initial=-np.inf)}
 
     def combine(self, total, partial):
-        return {
-            "least": np.minimum(total["least"], partial["least"]),
-            "most": np.maximum(total["most"], partial["most"]),
-        }
+        return {name: f(total[name], partial[name]) for name, f in (("least", np.minimum), ("most", np.maximum))}
 
 
 def test_reductions_are_those_of_all_rows(tmp_path):
@@ -471,17 +440,11 @@ def test_a_mean_of_large_numbers_does_not_cancel():
     assert none["count"] == 0 and np.isnan(none["mean"]).all() and np.isnan(none["std"]).all()
 
 
-@pytest.mark.parametrize(
-    "reduction",
-    [
-        jd.scale.Mean("y"),
-        jd.scale.Histogram("y", 0.0, 1.0),
-        jd.scale.Quantiles("y", 0.0, 1.0),
-        jd.scale.Worst("y", 3),
-        Extent(),
-    ],
-    ids=lambda x: type(x).__name__,
-)
+REDUCTIONS = [jd.scale.Mean("y"), jd.scale.Histogram("y", 0.0, 1.0), jd.scale.Quantiles("y", 0.0, 1.0)]
+REDUCTIONS += [jd.scale.Worst("y", 3), Extent()]
+
+
+@pytest.mark.parametrize("reduction", REDUCTIONS, ids=lambda x: type(x).__name__)
 def test_chunks_without_rollouts_change_no_bit_of_a_result(reduction):
     """First, last and in between; and shapes of partial results stay, so that memory does not grow."""
     values = np.random.default_rng(2).random(200)
@@ -496,9 +459,6 @@ def test_chunks_without_rollouts_change_no_bit_of_a_result(reduction):
 
 
 def test_a_run_of_many_chunks_merges_as_they_come():
-    from jaxdyn.scale.reductions import Reducer, Totals
-    from jaxdyn.scale.study import Summary
-
     values = np.random.default_rng(3).random(199)
     reductions = {"mean": jd.scale.Mean("y"), "own": Extent()}
     shapes = {f"quantity of {name}": jax.ShapeDtypeStruct((), np.float64) for name in reductions}
@@ -575,13 +535,12 @@ def test_bad_input_is_refused(tmp_path, options, error):
 
 
 def test_reductions_and_states_refuse(tmp_path):
+    times, options = np.linspace(0, 1, 3), {"out": tmp_path / "a", "samples": 3}
     for make in (
         lambda: jd.scale.Histogram("y", 1.0, 1.0),
         lambda: jd.scale.Quantiles("y", 0.0, 1.0, probabilities=(2.0,)),
         lambda: jd.scale.Worst("y", keep=0),
-        lambda: jd.scale.run(
-            jd.scenes.pendulum(), np.zeros(1), None, np.linspace(0, 1, 3), out=tmp_path / "a", samples=3
-        ),
+        lambda: jd.scale.run(jd.scenes.pendulum(), np.zeros(1), None, times, **options),
     ):
         with pytest.raises(ValueError, match="give"):
             make()
@@ -643,8 +602,6 @@ def states(p):
 
 @pytest.mark.long
 def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
-    from jaxdyn.cli import main
-
     study = tmp_path / "study.toml"
     study.write_text(STUDY)
     (tmp_path / "study.py").write_text(FUNCTIONS)
@@ -690,8 +647,6 @@ def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
     ],
 )
 def test_sweep_refuses(tmp_path, capsys, old, new, error):
-    from jaxdyn.cli import main
-
     study = tmp_path / "study.toml"
     study.write_text(STUDY.replace(old, new))
     (tmp_path / "study.py").write_text(FUNCTIONS)
@@ -703,8 +658,6 @@ def test_sweep_refuses(tmp_path, capsys, old, new, error):
 
 @pytest.mark.long
 def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
-    from jaxdyn.cli import main
-
     builder = jd.ModelBuilder("arm")
     builder.add_body("rod", None, "revolute", (1.0, (0, 0, 0.3), (0.1, 0.1, 0.01)), axis=(0, 1, 0))
     jd.save_urdf(builder.build(), tmp_path / "arm.urdf")
@@ -740,8 +693,6 @@ SPRING = """<mujoco><compiler angle="radian"/><worldbody><body>
 
 def test_sweep_takes_couplings_springs_and_damping_of_a_file(tmp_path):
     """A coupled and damped pair: (J + 4 J) dv/dt = -0.4 v, from the projection of v0; a spring at its reference, w = 2."""
-    from jaxdyn.cli import main
-
     study, head = tmp_path / "study.toml", 'out = "a.zarr"\nsamples = 2\nduration = 1.0\n'
     (tmp_path / "rotors.urdf").write_text(ROTORS)
     study.write_text(head + 'scene = "rotors.urdf"\n[parameters]\nv0 = { uniform = [1.0, 1.0], size = 2 }\n')
