@@ -96,7 +96,8 @@ class Terminal(eqx.Module):
     **Arguments:** `function`: function(q (nq,), v (nv,), t ()) -> (), smooth, and above zero at the start. An equinox Module or
     a `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define it once.
     NaN counts as below zero, as behind the end of a root's domain. A traced run that does not start above zero has the code
-    `bad_event`.
+    `bad_event`. Where it changes its sign several times within a step, the time may be that of a later zero, or of the save
+    point that shows it, whose derivative is zero: give shorter steps.
 
     **Raises:** ValueError for what cannot be called so, and, by `jd.simulate`, for a known start at which it is not above zero
     and for a scene whose forces have modes.
