@@ -194,10 +194,10 @@ def _tangential_errors(errors: tuple, *corrections) -> tuple:
 
 
 def _turn_by_rounding(scene: Scene, q, v, t, A, some: Callable, every: Callable):
-    """Largest change of v where rounding moves q off the constraints, whose rows are A; zero up to `NEAR` of v.
+    """Largest change of v, (), where rounding moves q off the constraints, whose rows are A (nh, nv); zero up to `NEAR` of v.
 
-    At a distance d from a position where branches of the constraints meet it is eps/d^2 of v: very near, rounding decides on
-    which branch the motion goes on, however short its steps are.
+    `some` and `every` as of `_correct`. At a distance d from a position where branches of the constraints meet it is eps/d^2 of
+    v: very near, rounding decides on which branch the motion goes on, however short its steps are.
     """
     eps = float(jnp.finfo(v.dtype).eps)
     # Rows lose their size where branches meet, but not the rounding of their terms.
