@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import entry_point
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.identify.geometry_errors import (
@@ -181,14 +182,14 @@ def fit_geometry(
     root = inverse * here.rows(noise)
     tip = here.jacobian[:, ~here.turns].reshape(-1, len(units)) @ root
     twists = (directions @ minimum.y).reshape(-1, 6)
-    scene: Any = change_scene(mechanism, jnp.asarray(twists, mechanism.model.home.dtype))
-    base, tool = (np.asarray(se3.exp(jnp.asarray(twists[place]))) for place in (0, mechanism.tool))
-    base, values = data.base @ base, minimum.y * units
+    scene, *motions = _apply_twists(mechanism, twists, data.base)
+    tool, base, place, place_by_twist = map(np.asarray, motions)
+    values = minimum.y * units
     root *= units[:, None]
     if "base" in free:
         # Position and rotation vector instead of the twist from a start that follows the noise; the base's numbers come first.
-        values[:6] = _position_and_turn(base, np.zeros(6))
-        root[:6] = np.asarray(jax.jacfwd(_position_and_turn, 1)(base, np.zeros(6))) @ root[:6]
+        values[:6] = place
+        root[:6] = place_by_twist @ root[:6]
     if max(noise[0] / mechanism.size, noise[1] * here.turns.any()) > _DOUBTFUL:
         warnings.warn(
             f"the errors that remain, {noise[0]:.3g} m and {noise[1]:.3g} rad, are no noise of a device on an arm of "
@@ -220,10 +221,19 @@ def fit_geometry(
     )
 
 
-def _position_and_turn(pose, twist):
-    """Position and rotation vector (6,) of a pose that is moved by a twist in its own axes."""
-    moved = pose @ se3.exp(jnp.asarray(twist))
-    return jnp.concatenate([moved[:3, 3], so3.log(moved[:3, :3])])
+@entry_point
+def _apply_twists(mechanism: Mechanism, twists, base):
+    """Scene, tool and base after the changes; the base's position and rotation vector (6,), and their derivative (6, 6)."""
+    moved = base @ se3.exp(twists[0])
+
+    def position_and_turn(twist):
+        pose = moved @ se3.exp(twist)
+        return jnp.concatenate([pose[:3, 3], so3.log(pose[:3, :3])])
+
+    zero = jnp.zeros_like(twists[0])
+    scene = change_scene(mechanism, twists.astype(mechanism.model.home.dtype))
+    place, place_by_twist = position_and_turn(zero), jax.jacfwd(position_and_turn)(zero)
+    return scene, se3.exp(twists[mechanism.tool]), moved, place, place_by_twist
 
 
 class _Linear(NamedTuple):

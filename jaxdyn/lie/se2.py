@@ -8,7 +8,7 @@ Each function is the part of its namesake there with z = 0. Every function takes
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.lie.series import accept_lists, inverse_coefficient, stumpff
+from jaxdyn.lie.series import compile_each, inverse_coefficient, stumpff
 
 from .so3 import matmul
 
@@ -270,7 +270,7 @@ __all__ = [
     "vee",
 ]
 
-accept_lists(globals())
+compile_each(globals())
 
 
 def __dir__() -> list[str]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.lie.series import accept_lists, inverse_coefficient, stumpff
+from jaxdyn.lie.series import compile_each, inverse_coefficient, stumpff
 
 from . import so3
 from .so3 import cross, matmul
@@ -272,7 +272,7 @@ __all__ = [
     "vee",
 ]
 
-accept_lists(globals())
+compile_each(globals())
 
 
 def __dir__() -> list[str]:

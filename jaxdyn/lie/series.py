@@ -6,6 +6,7 @@ where), because an overflowing or undefined branch that is not selected still ha
 """
 
 import functools
+import inspect
 import math
 from typing import Any
 
@@ -120,13 +121,19 @@ def safe_sqrt(square: Array) -> Array:
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, jnp.ones_like(square))), jnp.zeros_like(square))
 
 
-def accept_lists(module: dict[str, Any]) -> None:
-    """Let the public functions in the namespace of a module take lists of numbers in place of arrays."""
+def compile_each(module: dict[str, Any]) -> None:
+    """Let the public functions in the namespace of a module take lists of numbers, each as one program outside of traces.
+
+    Within a trace a function adds its operations as it would without `jax.jit`, but is traced once for all calls.
+    """
 
     def accepting(function):
+        static = {"sequence"} & set(inspect.signature(function).parameters)
+        program = jax.jit(function, static_argnames=tuple(static), inline=True)
+
         @functools.wraps(function)
         def call(*args, **options):
-            return function(*map(_as_array, args), **{name: _as_array(x) for name, x in options.items()})
+            return program(*map(_as_array, args), **{name: _as_array(x) for name, x in options.items()})
 
         return call
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.lie.series import accept_lists, angle_ratio, inverse_coefficient, stumpff
+from jaxdyn.lie.series import compile_each, angle_ratio, inverse_coefficient, stumpff
 
 Vector = Float[Array, "3"]
 Matrix = Float[Array, "3 3"]
@@ -360,7 +360,7 @@ __all__ = [
     "vee",
 ]
 
-accept_lists(globals())
+compile_each(globals())
 
 
 def __dir__() -> list[str]:
