@@ -122,9 +122,9 @@ def safe_sqrt(square: Array) -> Array:
 
 
 def compile_each(module: dict[str, Any]) -> None:
-    """Let the public functions in the namespace of a module take lists of numbers, each as one program outside of traces.
+    """Make each public function in the namespace of a module one program outside of traces, and let it take lists of numbers.
 
-    Within a trace a function adds its operations as it would without `jax.jit`, but is traced once for all calls.
+    Within traces it is traced once for all calls of a shape, and written out where it is called.
     """
 
     def accepting(function):

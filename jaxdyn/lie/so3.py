@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.lie.series import compile_each, angle_ratio, inverse_coefficient, stumpff
+from jaxdyn.lie.series import angle_ratio, compile_each, inverse_coefficient, stumpff
 
 Vector = Float[Array, "3"]
 Matrix = Float[Array, "3 3"]

@@ -595,3 +595,23 @@ def test_lists_are_arrays(name, monkeypatch):
     for key, value in public_calls(name, x.tolist(), y.tolist()).items():
         np.testing.assert_array_equal(value, wanted[key], err_msg=key)
     assert np.asarray(so3.hat(phi=[1, 2, 3])).dtype == float
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_outside_of_traces_a_function_is_one_program(name):
+    """And under `jax.vmap` alone; each operation by itself would be compiled and called."""
+    group, events = GROUPS[name], []
+    x = jnp.asarray(random_elements(name, 1)[0])
+    calls = [(group.exp, x), (jax.vmap(group.exp), jnp.stack([x, x]))]
+
+    def note(event, seconds, **_):
+        events.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        for call, argument in calls:
+            events.clear()
+            call(argument)
+            assert sum(event.endswith("backend_compile_duration") for event in events) <= 1
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
