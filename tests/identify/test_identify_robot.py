@@ -23,11 +23,16 @@ from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, is_white, jackknife, model_error_factors
 
 
+@jax.jit
+@jax.vmap
+def change_inertia(x, step):
+    return inertia.from_log_cholesky(inertia.to_log_cholesky(x) + step)
+
+
 def arm(stretch=0.0, seed=0):
     """The arm of two links; `stretch` is the size of a random change of both."""
     model, step = planar_arm(), stretch * np.random.default_rng(seed).normal(size=(2, 10))
-    move = jax.jit(jax.vmap(lambda x, step: inertia.from_log_cholesky(inertia.to_log_cholesky(x) + step)))
-    return model.replace(inertias=move(model.inertias, step))
+    return model.replace(inertias=change_inertia(model.inertias, step))
 
 
 def motion(seed, n=300, duration=6.0):
