@@ -22,7 +22,7 @@ from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.mode import careful, remedy_of, standalone
-from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of, objects
+from jaxdyn.compile.program import FLOATS, Array, Constant, Program, TooLong, kind_of, objects
 from jaxdyn.compile.stored import features as host_features
 from jaxdyn.compile.trace import program_of
 
@@ -103,13 +103,23 @@ def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> t
 
 
 def jacobian_routine(routine: Routine, symbol: str) -> Routine:
-    """Routine of the derivatives of all float results by all float arguments; see `jacobian_program`."""
-    with standalone():
-        program = jacobian_program(routine.program, symbol)
-    if routine.careful is None:
-        return Routine(symbol, program, None)
-    with standalone(), careful():
-        return Routine(symbol, program, jacobian_program(routine.careful, symbol))
+    """Routine of the derivatives of all float results by all float arguments; see `jacobian_program`.
+
+    **Raises:** ValueError for more operations than the compiler takes.
+    """
+    try:
+        with standalone():
+            program = jacobian_program(routine.program, symbol)
+        if routine.careful is None:
+            return Routine(symbol, program, None)
+        with standalone(), careful():
+            return Routine(symbol, program, jacobian_program(routine.careful, symbol))
+    except TooLong as error:
+        count = sum(array.size for array in routine.program.inputs if array.dtype.kind == "f")
+        raise ValueError(
+            f"derivatives: the Jacobian by all {count} numbers of the arguments has {error}; let the function close over those "
+            "that it need not be differentiated by, such as a model"
+        ) from None
 
 
 def jacobian_program(program: Program | Directions, name: str) -> Program | Directions:

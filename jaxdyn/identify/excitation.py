@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.selection import degrees_of_freedom
+from jaxdyn.constraints.selection import degrees_of_freedom, independent_rows
 from jaxdyn.dynamics.quantities import bias_force, inverse_dynamics
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.mechanisms import check_motors, follow_motors, motor_basis
@@ -217,4 +217,6 @@ def make_robot(scene: Scene, motors: Sequence[str] | None, guess) -> DrivenRobot
             f"{model.name!r} has loops and {count} degrees of freedom; name as many of its joints in motors "
             f"({', '.join(model.joint_names)})"
         )
-    return DrivenRobot(scene, start, check_motors(scene, start, motors))
+    columns = check_motors(scene, start, motors)
+    # Loops of a rounded file close but for redundant rows, which stay open by its rounding.
+    return DrivenRobot(independent_rows(scene, start, 0.0), start, columns)

@@ -33,8 +33,9 @@ OBJECTIVES = ("logdet", "condition")
 _TURN, _SPEED = np.pi, 2.0
 # 100 samples are 20 in a period of the fifth harmonic, the default; peaks are checked on a finer grid.
 _SAMPLES, _CHECKED = 100, 1000
-# Speed of a passive joint without a limit of its own over that of a motor; largest residual of closed loops (m, rad).
-_PASSIVE, _CLOSED = 5.0, 1e-8
+# Speed of a passive joint without a limit of its own over that of a motor; largest residual of closed loops (m, rad), as a power
+# of eps: 1.5e-8 in float64.
+_PASSIVE, _CLOSED = 5.0, 0.5
 
 
 class Excitation(NamedTuple):
@@ -225,7 +226,7 @@ def _limits(robot: DrivenRobot, margin: float, velocity, torque) -> _Limits:
 
     def of(value, otherwise, n=n):
         numbers = np.full(n, otherwise) if value is None else np.asarray(value, np.float64)
-        if numbers.shape not in ((), (n,)):
+        if numbers.shape not in ((), (1,), (n,)):
             raise ValueError(f"limits {numbers.tolist()} are of {numbers.size} joints; give one number, or {n}")
         numbers = np.broadcast_to(numbers, (n,)).copy()
         return np.where(np.isfinite(numbers), numbers, otherwise)
@@ -304,7 +305,7 @@ def _loss(scaled, args):
     ]
     if task.robot.motors is not None:
         # Near a dead point speeds have no bound, beyond it the loops stay open: such motions are left out.
-        excess = [*(jnp.max(x) for x in over), jnp.max(gap) - _CLOSED]
+        excess = [*(jnp.max(x) for x in over), jnp.max(gap) - float(jnp.finfo(gap.dtype).eps) ** _CLOSED]
         return jnp.where(jnp.max(jnp.stack(excess)) <= 0, value, jnp.inf)
     return value + 100 * sum(jnp.mean(jnp.maximum(x, 0) ** 2) for x in over)
 
@@ -347,7 +348,7 @@ def _limit_shares(motion: FourierMotion, task: _Task) -> dict[str, float]:
         "position": np.abs(q - (lower + upper) / 2) / ((upper - lower) / 2),
         "velocity": np.abs(v) / speed,
         "torque": np.abs(tau) / torque,
-        "closure": gap / _CLOSED,
+        "closure": gap / float(jnp.finfo(times.dtype).eps) ** _CLOSED,
     }
     # Newton's method on loops that cannot be closed may leave the numbers.
     return {name: float(np.nan_to_num(values, nan=np.inf).max()) for name, values in sizes.items()}

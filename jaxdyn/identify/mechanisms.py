@@ -239,7 +239,8 @@ def motor_basis(scene: Scene, q, v, t, columns: tuple[int, ...]) -> tuple[Float[
     identity, so that N^T takes the torques at all joints to those of the motors with the same power: the forces of ideal
     constraints do no work, and cancel.
     """
-    row, motors = rows(scene, q, v, t), np.array(columns)
+    # Rows that repeat others but for the rounding of a file contradict these by it.
+    row, motors = rows(independent_rows(scene, q, t), q, v, t), np.array(columns)
     passive = np.setdiff1d(np.arange(scene.nv), motors)
     # Redundant rows are consistent: least squares solves them exactly, where the motors determine the passive joints.
     own = row.A[:, passive]

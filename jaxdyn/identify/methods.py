@@ -357,7 +357,9 @@ class RandomSteps(Method):
         """Make one step."""
         rng = np.random.default_rng((self.seed, len(history)))
         points = jax.tree.map(
-            lambda x, size: np.asarray(x) + iterate.state * size * rng.normal(size=(_CHANGES, *x.shape)),
+            lambda x, size: (np.asarray(x) + iterate.state * size * rng.normal(size=(_CHANGES, *x.shape))).astype(
+                x.dtype
+            ),
             iterate.point,
             self.sizes,
         )

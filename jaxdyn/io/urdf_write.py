@@ -70,9 +70,9 @@ def save_urdf(
     `torques`: additional torque parameters by joint name, which URDF lacks, as {"shoulder": {"offset": 0.3}}. They go into
     an element `<jaxdyn>` below `<robot>`, which other readers ignore; `jd.io.read_torque_terms` reads them.
 
-    **Raises:** ValueError naming the joint or body for features that URDF cannot express: helical and spherical joints, limits
-    of planar and free joints, friction or armature that differs between the directions of one joint, first moments
-    without mass; for `torques` of joints that the model does not have, or numbers that are not finite.
+    **Raises:** ValueError naming the joint or body for features that URDF cannot express: helical and spherical joints, screws
+    that are not of unit length, limits of planar and free joints, friction or armature that differs between the directions of
+    one joint, first moments without mass; for `torques` of joints that the model does not have, or numbers that are not finite.
     OSError when the file cannot be written.
     """
     check_shapes(model)
@@ -223,6 +223,10 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
         screw = np.asarray(model.screws, np.float64)[edge.body]
         # A planar joint of a model moves in the x-y plane, and URDF gives the normal.
         axis = {"planar": np.array([0.0, 0.0, 1.0]), "prismatic": screw[:3]}.get(kind, screw[3:])
+        # Readers divide axes by their length, which scales the coordinate here.
+        length = float(np.linalg.norm(axis))
+        if abs(length - 1) > 1e-6:
+            raise ValueError(f"{what} has a screw of length {length:.6g}; URDF has unit axes, so scale it to 1")
         ET.SubElement(joint, "axis", xyz=_text(axis))
     _write_limits(joint, model, edge.body, what)
     given = {key: getattr(model, key) for key in ("damping", "friction", "armature")}

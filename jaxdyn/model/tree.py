@@ -100,7 +100,8 @@ class Model(eqx.Module):
         """Copy with some leaves, or the `rounding` of its poses, replaced, e.g. `model.replace(gravity=None)`.
 
         **Raises:** ValueError for a name that is not a leaf, for a shape that differs from the present one, and for NaN or
-        infinity (limits may be infinite), with the body, joint or frame that they belong to.
+        infinity (limits may be infinite) and entries of `screws` that the joint's kind leaves out, with the body, joint or frame
+        that they belong to.
 
         **Warns:** UserWarning naming bodies whose new `inertias` are unphysical, as `ModelBuilder.build` does.
         """
@@ -213,6 +214,8 @@ def _replace(model: Model, leaves: dict) -> Model:
             raise ValueError(f"replace: {name} has shape {np.shape(value)}, expected {want}")
         if is_concrete(value):
             _check_finite(model, name, np.asarray(value))
+        if name == "screws" and is_concrete(value):
+            _check_screws(model, np.asarray(value))
         if name == "inertias" and is_concrete(value):
             warn_unphysical_inertias(dict(zip(model.body_names, np.asarray(value), strict=True)))
         # Arrays of jax keep their dtype: the caller may differentiate a leaf of another precision.
@@ -252,6 +255,20 @@ def _check_finite(model: Model, name: str, values: np.ndarray) -> None:
         what = f"{name} of joint {next(j for j, s in zip(top.joint_names, slices, strict=True) if s.start <= row < s.stop)!r}"
     shown = values if name == "gravity" else values[row]
     raise ValueError(f"replace: {what} is {shown.tolist()}; give finite numbers")
+
+
+def _check_screws(model: Model, screws: np.ndarray) -> None:
+    """Refuse entries that joints of their kinds leave out. **Raises:** ValueError that names the first such body."""
+    unused = np.where(model.topology.screw_mask, 0, np.abs(screws))
+    # Screws that were transformed have entries of rounding there.
+    bad = (unused > 1e-6 * np.abs(screws).max(axis=1, initial=0, keepdims=True)).any(axis=1)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(
+            f"replace: screws of body {model.body_names[i]!r} is {screws[i].tolist()}, and its joint is "
+            f"{model.topology.kinds[i]}: revolute axes pass through the body's origin, which `home` places, and prismatic joints "
+            "do not turn; change `home`, or build another kind"
+        )
 
 
 def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:

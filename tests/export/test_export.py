@@ -555,6 +555,13 @@ def test_refusals(function, examples, options, message):
         jd.export(function, *examples, **options)
 
 
+def test_jacobians_beyond_the_number_of_operations_name_the_fix(monkeypatch):
+    exported = jd.export(lambda x: jnp.cumprod(jnp.sin(x)), X, name="wide")
+    monkeypatch.setattr(standalone, "MAX_OPERATIONS", exported.value.program.cost + 10)
+    with pytest.raises(ValueError, match=r"Jacobian by all 7 numbers .* more than .* operations; .* close over"):
+        jd.export(lambda x: jnp.cumprod(jnp.sin(x)), X, name="wide", derivatives=("jacobian",))
+
+
 def test_names_that_meet_others(tmp_path):
     """Arguments with the name of the result, and with one of <math.h>."""
     jd.export(lambda out, y0: out + y0, X, X, name="add", derivatives="jacobian").save(tmp_path)

@@ -384,6 +384,39 @@ def test_an_exciting_motion_of_the_motors_of_a_five_bar(tmp_path):
             jd.identify.exciting_motion(scene, TERMS, guess=start, **options, **arguments)
 
 
+ROUNDED_FOUR_BAR = """<robot name="four-bar"><link name="base"/>
+<joint name="j1" type="revolute"><parent link="base"/><child link="a"/><origin rpy="1.5708 0 0"/><axis xyz="0 0 1"/>
+<limit lower="-3" upper="3" effort="50" velocity="5"/></joint>
+<joint name="j2" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.3 0 0" rpy="-1.5708 0 0"/>
+<axis xyz="0 -1 0"/><limit lower="-3" upper="3" effort="50" velocity="5"/></joint>
+<joint name="j3" type="revolute"><parent link="base"/><child link="c"/><origin xyz="0.8 0 0"/><axis xyz="0 -1 0"/>
+<limit lower="-3" upper="3" effort="50" velocity="5"/></joint>
+<gazebo><joint name="pin" type="revolute"><parent>c</parent><child>b</child><pose>0.5 0 0.4 0 0 0</pose>
+<axis><xyz>0 1 0</xyz></axis></joint></gazebo>"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_exciting_motions_of_rounded_files_and_in_float32_use_the_limits(tmp_path, dtype):
+    """Redundant rows that rounding leaves open, and gaps by the rounding of float32, stop no motion."""
+    links = "".join(
+        f'<link name="{name}"><inertial><origin xyz="0.1 0.01 0.05"/><mass value="{mass}"/>'
+        '<inertia ixx="0.02" iyy="0.03" izz="0.025" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        for name, mass in zip("abc", (1.1, 2.2, 1.3), strict=True)
+    )
+    (tmp_path / "four_bar.urdf").write_text(f"{ROUNDED_FOUR_BAR}{links}</robot>")
+    scene = jd.load(tmp_path / "four_bar.urdf", dtype=dtype)
+    # The command passes its numbers as lists.
+    options = dict(motors=["j1"], velocity=[1.0], torque=[100.0], steps=2, starts=1, harmonics=2)
+    found = jd.identify.exciting_motion(scene, ("viscous",), **options)
+    assert 0.5 < found.used["velocity"] <= 1
+    if dtype == jnp.float64:
+        whole = found.log(whole=True)
+        # The least squares of all rows, redundant ones too, would miss by the rounding of the file, 4e-6.
+        dynamics = jax.jit(jax.vmap(lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration))
+        np.testing.assert_allclose(dynamics(whole.q, whole.v, whole.tau), whole.a, atol=1e-10)
+
+
 def test_the_command_excites_a_mechanism_by_named_motors_alone(tmp_path, capsys):
     loaded(tmp_path, "four-bar", (0.9, 1.5))
     assert main(["excite", str(tmp_path / "four-bar-0.9.xml")]) != 0

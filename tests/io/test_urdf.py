@@ -557,6 +557,9 @@ def test_what_urdf_cannot_express_is_refused_by_name(tmp_path):
         with pytest.raises(ValueError, match=message):
             jd.save_urdf(model, tmp_path / "out.urdf")
         assert not (tmp_path / "out.urdf").exists()
+    model = robots.iiwa()
+    with pytest.raises(ValueError, match="screw of length 2; URDF has unit axes"):
+        jd.save_urdf(model.replace(screws=2 * model.screws), tmp_path / "out.urdf")
     with pytest.raises(OSError, match="nowhere"):
         jd.save_urdf(robots.iiwa(), tmp_path / "nowhere" / "out.urdf")
 

@@ -478,6 +478,20 @@ def test_inertias_that_no_body_has_are_named(moments, words):
             assert caught[0].filename == __file__
 
 
+def test_screws_that_a_kind_leaves_out_are_refused():
+    """They would have no effect: dynamics use the entries of the joint's kind."""
+    ball = jd.inertia.sphere(1.0, 1.0)
+    model = jd.ModelBuilder().add_body("a", joint="prismatic", inertia=ball)
+    model = model.add_body("b", "a", joint="revolute", inertia=ball).build()
+    for body, screw in ((0, (0, 0, 1, 0, 0.1, 0)), (1, (0.2, 0, 0, 0, 0, 1))):
+        with pytest.raises(ValueError, match=f"replace: screws of body '{'ab'[body]}' is .* its joint is"):
+            model.replace(screws=model.screws.at[body].set(jnp.array(screw, float)))
+    # Scaled axes scale the coordinate, and entries of rounding stay.
+    scaled = model.replace(screws=2 * model.screws.at[1, 0].set(1e-12))
+    q = jnp.array([0.3, 0.4])
+    np.testing.assert_allclose(jd.mass_matrix(scaled, q), 4 * jd.mass_matrix(model, 2 * q), atol=1e-12)
+
+
 @pytest.mark.parametrize("bad", [np.nan, -np.inf])
 def test_numbers_that_are_not_finite_are_refused_with_their_body(bad):
     """Whatever entry is bad, however the model is made of it."""
