@@ -23,7 +23,7 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.identify.methods import GradientSteps, RandomSteps
 from jaxdyn.identify.regression import base_parameters, free_columns, group_columns
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
-from jaxdyn.model.arguments import Checked, Numbers
+from jaxdyn.model.arguments import Checked, Numbers, check_known
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
@@ -160,6 +160,7 @@ def exciting_motion(
     Source: Swevers et al. (1997), "Optimal robot excitation and identification"; Park (2006), "Fourier-based optimal excitation
     trajectories for the dynamic identification of robots".
     """
+    check_known("exciting_motion", system=system, guess=guess)
     terms, robot = check_terms(terms, v_s), make_robot(as_scene(system), motors, guess)
     model, driven = robot.model, robot.joints
     if objective not in OBJECTIVES:

@@ -31,7 +31,7 @@ from jaxdyn.identify.geometry_errors import (
     solve_loops,
 )
 from jaxdyn.lie import se3, so3
-from jaxdyn.model.arguments import Checked, Numbers, as_array, check_count, check_seed
+from jaxdyn.model.arguments import Checked, Numbers, as_array, check_count, check_known, check_seed
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import SceneLike
@@ -155,6 +155,7 @@ def fit_geometry(
     fit = jd.identify.fit_geometry(arm, q, poses, frame="flange")
     ```
     """
+    check_known("fit_geometry", system=system, q=q, poses=poses, positions=positions, markers=markers)
     mechanism = make_mechanism(system, frame, measured)
     q = check_configurations(mechanism, q)
     data = check_measurements(len(q), poses, positions, markers)
@@ -381,6 +382,7 @@ def choose_poses(
 
     Source: Borm & Menq (1991), observability; Mitchell (1974), exchange of designs.
     """
+    check_known("choose_poses", system=system, guess=guess)
     mechanism = make_mechanism(system, frame, measured)
     count, rng = check_count(count, "count"), np.random.default_rng(check_seed(seed))
     _, directions, _ = free_directions(mechanism, free)

@@ -37,7 +37,7 @@ from jaxdyn.identify.regression import (
 from jaxdyn.identify.result import Fit, torques_along
 from jaxdyn.identify.torque_terms import LEAVES, POSITIVE, TERMS, Friction, Terms, check_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
-from jaxdyn.model.arguments import Numbers, warn
+from jaxdyn.model.arguments import Numbers, check_known, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
@@ -133,6 +133,7 @@ def least_squares(
 
     Source: Atkeson, An & Hollerbach (1986); Gautier (1991).
     """
+    check_known("least_squares", model=model, log=log)
     terms = check_terms(terms, v_s)
     logs = as_logs(log, model)
     base = base_parameters(model, terms, v_s=v_s)
@@ -257,6 +258,7 @@ def identifiability(
 
     Source: Gautier & Khalil (1992), "Exciting trajectories for the identification of base inertial parameters of robots".
     """
+    check_known("identifiability", model=model, log=log)
     logs = as_logs(log, model)
     base = base_parameters(model, terms, v_s=v_s)
     # These columns are independent on a general motion, so that any loss of rank is due to the logs.
@@ -341,6 +343,7 @@ def fit_mechanism(
 
     Source: Khalil & Dombre (2002), chapters 9 and 10, base parameters of closed chains.
     """
+    check_known("fit_mechanism", scene=scene, log=log)
     terms = check_terms(terms, v_s)
     logs = as_logs(log, scene.system)
     columns = np.array(check_motors(scene, np.asarray(logs[0].q)[0], motors))

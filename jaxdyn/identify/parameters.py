@@ -49,7 +49,7 @@ from jaxdyn.identify.problem import (
 from jaxdyn.identify.regression import Blocks, block_slices, least_squares_by_svd, triangle_of
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, jackknife, student
-from jaxdyn.model.arguments import Checked, Function
+from jaxdyn.model.arguments import Checked, Function, check_known
 from jaxdyn.tasks import count_workers, map_tasks
 
 # Excess of the loss of the interior point over the minimum, as a share of the prior's weight.
@@ -102,6 +102,7 @@ def fit_parameters(
     fit = jd.identify.fit_parameters(pendulum, log, positive=lambda system: system.parameters["length"])
     ```
     """
+    check_known("fit_parameters", system=system, log=log)
     objective, solver, execution = merge_options(options, objective, solver, execution)
     tree = _tree(system, parameters, positive, free)
     problem, logs = pose_problem(tree, objective, log, execution.devices)

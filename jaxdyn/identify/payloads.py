@@ -44,7 +44,7 @@ from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, check_terms, 
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
 from jaxdyn.model import host_math
 from jaxdyn.model import inertia as _inertia
-from jaxdyn.model.arguments import Numbers, deprecated, warn
+from jaxdyn.model.arguments import Numbers, check_known, deprecated, warn
 from jaxdyn.model.tree import Model
 
 # Most evaluations of the errors.
@@ -128,6 +128,7 @@ def fit_gains(
     Source: Gautier & Briot (2014), "Global identification of joint drive gains and dynamic parameters of robots", ASME Journal of
     Dynamic Systems, Measurement, and Control 136; errors here are those of the currents, which least squares over both allows.
     """
+    check_known("fit_gains", model=model, unloaded=unloaded, loaded=loaded)
     unloaded, loaded = as_logs(unloaded, model), as_logs(loaded, model)
     terms = check_terms(terms, 1.0)
     body = _holder(model, body)
@@ -394,6 +395,7 @@ def fit_payload(
 
     Source: Khalil & Dombre (2002), section 12.7; Gaz & De Luca (2017), "Payload estimation based on identified coefficients".
     """
+    check_known("fit_payload", model=model, unloaded=unloaded, loaded=loaded)
     check_bodies(model)
     unloaded, loaded = as_logs(unloaded, model), as_logs(loaded, model)
     body = _holder(model, body)

@@ -21,7 +21,7 @@ from jaxdyn.identify.logs import (
     root_mean_square,
 )
 from jaxdyn.identify.regression import log_regressor, nominal_parameters
-from jaxdyn.model.arguments import Checked, Numbers, warn
+from jaxdyn.model.arguments import Checked, Numbers, check_known, warn
 from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
 
@@ -77,6 +77,7 @@ def from_raw(
 
     Source: the off-line preparation usual in robot identification (Gautier 1997; Khalil & Dombre 2002, section 12.4).
     """
+    check_known("from_raw", t=t, q=q, tau=tau)
     for name, value, minimum in (("order", order, 1), ("trim", trim, 0), ("every", every, 1)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < minimum:
             raise ValueError(f"{name} is {value!r}; give a whole number of at least {minimum}")

@@ -24,7 +24,7 @@ from jaxdyn.identify.result import Fit, residuals
 from jaxdyn.identify.robot_logs import RobotLogs, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, improving_torques, search, splits
 from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, TorqueTerm, candidates, check_terms, split_terms
-from jaxdyn.model.arguments import Checked, Numbers, deprecated, warn
+from jaxdyn.model.arguments import Checked, Numbers, check_known, deprecated, warn
 from jaxdyn.model.description import short, table
 from jaxdyn.model.tree import Model
 from jaxdyn.tasks import DaskClient, open_engine
@@ -272,6 +272,7 @@ def fit_robot(
     identification: a convex programming approach", divergence and convexity; Stone (1974), cross-validation; Holland & Welsch
     (1977), iteratively reweighted least squares.
     """
+    check_known("fit_robot", model=model, log=log)
     check_bodies(model)
     given = logs = as_logs(log, model)
     if blocks < 2:
@@ -371,6 +372,7 @@ def fit_torques(
     fit = jd.identify.fit_torques(model, log, ("viscous", "coulomb"), v_s=0.001)
     ```
     """
+    check_known("fit_torques", model=model, log=log)
     check_bodies(model)
     logs, terms = as_logs(log, model), check_terms(terms, v_s)
     check_prior(prior)

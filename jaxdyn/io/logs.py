@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxdyn.identify.log_repair import repair_log
 from jaxdyn.identify.logs import Log
-from jaxdyn.model.arguments import Checked, FilePath, as_path, parse_number
+from jaxdyn.model.arguments import Checked, FilePath, as_path, check_known, parse_number
 from jaxdyn.model.tree import Model
 
 _SIGNALS = ("q", "v", "a", "tau")
@@ -99,6 +99,7 @@ def write_log(path: FilePath, log: Log) -> None:
 
     **Raises:** ValueError for another file type.
     """
+    check_known("write_log", log=log)
     path = as_path(path)
     columns: dict[str, Any] = {"t": np.asarray(log.t)}
     # A quaternion has four coordinates for three velocities, so a name for each column of q does not exist.

@@ -13,7 +13,7 @@ from jaxdyn.io.loaded import Names
 from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import as_path, check_shapes, parse_number
+from jaxdyn.model.arguments import as_path, check_known, check_shapes, parse_number
 from jaxdyn.model.tree import Model
 
 
@@ -75,6 +75,7 @@ def save_urdf(
     one joint, first moments without mass; for `torques` of joints that the model does not have, or numbers that are not finite.
     OSError when the file cannot be written.
     """
+    check_known("save_urdf", model=model)
     check_shapes(model)
     path = as_path(path)
     root, edges = _edges(model)

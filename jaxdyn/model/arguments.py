@@ -339,6 +339,16 @@ def as_static(value: Any, what: str, low: Number, high: Number, fix: str) -> flo
     return float(value)
 
 
+def check_known(function: str, **arguments: Any) -> None:
+    """Refuse traced arguments of a function that computes with NumPy. **Raises:** ValueError with their names."""
+    traced = [name for name, value in arguments.items() if not is_concrete(value)]
+    if traced:
+        raise ValueError(
+            f"{' and '.join(traced)} of {function} {'is' if len(traced) == 1 else 'are'} traced; it needs known numbers: call it "
+            "outside of jax.jit, jax.vmap and jax.grad"
+        )
+
+
 def check_seed(value: object) -> int:
     """Check the seed of random numbers. **Raises:** ValueError for anything but an integer of 32 bits that is not negative."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < 2**32:

@@ -1,5 +1,6 @@
 """Keywords of fits that no other test passes, each by its effect."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -173,3 +174,30 @@ def test_keywords_of_exciting_motions():
     ended = identify.exciting_motion(model, callback=lambda step, loss: steps.append(loss) or step == 3, **few)
     assert ended.result is jd.RESULTS.stopped and len(ended.history) == 4
     np.testing.assert_array_equal(steps, ended.history)
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.vmap, jax.grad])
+@pytest.mark.parametrize(
+    ("name", "argument", "call"),
+    [
+        ("fit_torques", "log", lambda model, log, x: identify.fit_torques(model, measured_at(log, x))),
+        ("fit_robot", "model", lambda model, log, x: identify.fit_robot(model.replace(gravity=x[0, :3]), log)),
+        ("fit_parameters", "log", lambda model, log, x: identify.fit_parameters(model, measured_at(log, x))),
+        ("fit_payload", "loaded", lambda model, log, x: identify.fit_payload(model, log, measured_at(log, x))),
+        ("fit_geometry", "q", lambda model, log, x: identify.fit_geometry(model, x, np.eye(4)[None], frame="b")),
+        ("least_squares", "log", lambda model, log, x: identify.least_squares(model, measured_at(log, x))),
+        ("from_raw", "tau", lambda model, log, x: identify.from_raw(log.t, log.q, x)),
+        ("exciting_motion", "system", lambda model, log, x: identify.exciting_motion(model.replace(gravity=x[0, :3]), ())),
+        ("save_urdf", "model", lambda model, log, x: jd.save_urdf(model.replace(gravity=x[0, :3]), "never.urdf")),
+    ],
+)  # fmt: skip
+def test_fits_are_refused_within_transformations(name, argument, call, transform):
+    """They compute with NumPy: JAX's error on a conversion of arrays did not say so."""
+    model, log = arm(), motion(1, n=20)
+    with pytest.raises(ValueError, match=f"{argument} of {name} is traced"):
+        transform(lambda x: call(model, log, x))(jnp.ones((1, 20, 4) if transform is jax.vmap else (20, 4)))
+
+
+def measured_at(log, tau):
+    """The log with these torques."""
+    return identify.Log(log.t, log.q, log.v, log.a, tau[:, :2])
