@@ -45,7 +45,14 @@ from jaxdyn.reduction.bases import (
 from jaxdyn.reduction.minimal import minimal_velocity, solve_in_basis
 from jaxdyn.simulation.options import Solver, Stepsize
 from jaxdyn.systems.scene import Scene, as_pytree, is_given
-from jaxdyn.systems.system import displace, needs_retraction, rate_to_velocity, retract, velocity_to_rate
+from jaxdyn.systems.system import (
+    displace,
+    has_dependent_coordinates,
+    needs_retraction,
+    rate_to_velocity,
+    retract,
+    velocity_to_rate,
+)
 
 State: TypeAlias = dict[str, Any]  # arrays, and pytrees of them, by name
 StepEnd: TypeAlias = tuple[State, State | None, Array | None]  # of `Method.end_step`
@@ -362,11 +369,13 @@ def satisfies_redundant_rows(scene: Scene, q, v, t):
 def may_have_redundant_rows(scene: Scene) -> bool:
     """True where some set of coupled coordinates has at least as many rows as coordinates: it moves only if rows are redundant.
 
-    True for a scene of rounded numbers, and for one that is traced, too. A motion of exact numbers with redundant rows among
-    fewer than that is right without a selection, by the rank at every evaluation, in short steps.
+    True for a scene of rounded numbers, for one that is traced, and for one with dependent coordinates, too. A motion of exact
+    numbers with redundant rows among fewer than that is right without a selection, by the rank at every evaluation, in short
+    steps.
     """
     bare = scene.without_forces
-    if scene.rounding or not is_concrete(bare):
+    # Dependent coordinates at a generic configuration would have to be searched, from places that nobody has given.
+    if scene.rounding or not is_concrete(bare) or has_dependent_coordinates(scene.system):
         return True
     # Away from the neutral configuration, at which entries of A may vanish that do not vanish elsewhere.
     step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))

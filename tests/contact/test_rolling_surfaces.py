@@ -243,11 +243,12 @@ def test_assembly_from_far_away_ends_where_the_surfaces_touch():
 
 
 def egg_on_plane(axes):
-    """An egg that rolls on a plane, its centre of mass in the middle."""
+    """An egg that rolls on a plane, its centre of mass in the middle; a ball for None."""
+    shape = jd.contact.Sphere(AXES[2]) if axes is None else jd.contact.Ellipsoid(axes)
     builder = jd.ModelBuilder("egg", gravity=(0.0, 0.0, -9.81))
     builder.add_body("egg", None, "free", jd.inertia.ellipsoid(1.0, (0.3, 0.2, 0.25)))
     system = jd.contact.RollingModel(
-        builder.build(), [jd.contact.rolling_contact(None, jd.contact.Plane(), "egg", jd.contact.Ellipsoid(axes))]
+        builder.build(), [jd.contact.rolling_contact(None, jd.contact.Plane(), "egg", shape)]
     )
     return jd.Scene(system, system.rows)
 
@@ -325,6 +326,23 @@ def test_motions_are_batched_and_have_derivatives_in_states_and_shapes():
     # Differences of fourth order of numbers that are known to 1e-13.
     np.testing.assert_allclose(slopes, differences, atol=1e-7)
     np.testing.assert_allclose(value, end(AXES, OMEGA), rtol=1e-12)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", ["simulate", "stepper"])
+def test_a_known_scene_rolls_from_traced_starts(how):
+    """A ball on a plane, x = r w t; a generic configuration, by which rows are counted, lacked the places of the contact."""
+    scene, speed, time = egg_on_plane(None), 3.0, 1e-3
+
+    def end(speed):
+        q, v = egg_start(scene, jnp.array([0.0, 1.0, 0.0]) * speed)
+        if how == "stepper":
+            return jd.stepper(scene, time)((q, v), jnp.zeros(6))[0][:2]
+        return jd.simulate(scene, q, v, jnp.array([0.0, time])).q[-1, :2]
+
+    x, derivative = quick(lambda speed: (end(speed), jax.jacrev(end)(speed)))(speed)
+    np.testing.assert_allclose(x, [0.25 * speed * time, 0.0], atol=1e-12)
+    np.testing.assert_allclose(derivative, [0.25 * time, 0.0], atol=1e-12)
 
 
 @pytest.mark.slow

@@ -495,6 +495,31 @@ def test_the_direction_of_friction_in_an_impact_has_derivatives(adjoint):
 
 
 @pytest.mark.long
+def test_a_body_that_hits_the_ground_and_slides_obeys_coulombs_law():
+    """The impulse follows from the momenta, which are conserved in the flight behind it.
+
+    It is on the cone and against the velocity behind the impact, whose direction the search had left an error of up to 1e-6.
+    """
+    mu, e, corner, end = 0.2, 0.4, np.array([0.1, -0.05, -0.08]), 0.01
+    inertia = np.array([[0.02, 0.004, -0.003], [0.004, 0.03, 0.002], [-0.003, 0.002, 0.015]])
+    builder = jd.ModelBuilder("stone", gravity=(0.0, 0.0, 0.0))
+    builder.add_body("stone", None, "free", (1.0, np.zeros(3), inertia))
+    ground = jd.contact.ground_contact("stone", corner, friction=mu, restitution=e)
+    scene, q = jd.Scene(builder.build(), forces=[ground]), jnp.array([0.0, 0.0, 0.08, 1.0, 0.0, 0.0, 0.0])
+    for v in ([1.2, -0.3, -1.0, 2.0, -1.0, 4.0], [0.5, 0.9, -2.0, -3.0, 2.0, 1.0], [-1.0, 0.4, -1.5, 1.0, 3.0, -2.0]):
+        v = np.array(v)
+        after = jd.simulate(scene, q, jnp.asarray(v), jnp.array([0.0, end]), stepsize=within(1e-12))
+        assert float(after.events.time[0]) == 0.0 and np.isnan(after.events.time[1])
+        R, twist = np.asarray(jd.frame_pose(scene.system, after.q[-1], "stone"))[:3, :3], np.asarray(after.v[-1])
+        impulse, turn = R @ twist[:3] - v[:3], R @ inertia @ twist[3:] - inertia @ v[3:]
+        slip = v[:3] + impulse + np.cross(np.linalg.solve(inertia, inertia @ v[3:] + turn), corner)
+        np.testing.assert_allclose(turn, np.cross(corner, impulse), atol=1e-11)
+        np.testing.assert_allclose(slip[2], -e * (v[:3] + np.cross(v[3:], corner))[2], atol=1e-10)
+        assert np.linalg.norm(slip[:2]) > 0.1
+        np.testing.assert_allclose(impulse[:2], -mu * impulse[2] * slip[:2] / np.linalg.norm(slip[:2]), atol=1e-10)
+
+
+@pytest.mark.long
 def test_the_direction_in_which_friction_yields_has_derivatives():
     """A force that turns and grows moves a point from rest: gradients are the differences of values.
 

@@ -52,7 +52,7 @@ from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
 
 STICKS, SLIDES = 41, 81  # guesses in which all elements stick, or slide; the last one
-_ANGLE = 1.5e-7  # rad, up to which a direction is known, where that is more than rounding
+_ANGLE = 1.5e-7  # rad, up to which a direction is known where rounding of redundant forces turns it
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
 _ROOM = 2e-3  # of the friction of all elements, by which the friction of some that stick may grow beyond the cone
 _WEIGHT = 32  # changes of direction for which there is the same room as for one of a mode
@@ -77,11 +77,13 @@ class Problem(NamedTuple):
 class Choice(NamedTuple):
     """A mode while it is chosen, with directions of sliding (n, 2) and the number of changes.
 
-    `wrong`: whether an element disagreed; `done`: whether the search has ended.
+    `turn`: square (rad^2) of the last change of a direction; `wrong`: whether an element disagreed; `done`: whether the search
+    has ended.
     """
 
     mode: Mode
     slip: Array
+    turn: Array
     changes: Array
     wrong: Array
     done: Array
@@ -176,13 +178,13 @@ def search_mode(elements: Elements, problem: Problem, mode: Mode, slip, released
         return guess + 1, choice, busy & found.wrong & (guess < SLIDES)
 
     none, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    begin = none, Choice(mode, slip, none, ~no, no), jnp.asarray(wanted) & ~no
+    begin = none, Choice(mode, slip, jnp.zeros((), slip.dtype), none, ~no, no), jnp.asarray(wanted) & ~no
     return while_loop(lambda carry: carry[2], attempt, begin)[1]
 
 
 def choose_mode(elements: Elements, problem: Problem, mode: Mode, slip) -> Choice:
     """Change the first element that disagrees until none does."""
-    begin = Carry(Choice(mode, slip, jnp.zeros((), jnp.int32), *jnp.zeros((2,), bool)))
+    begin = Carry(Choice(mode, slip, jnp.zeros((), slip.dtype), jnp.zeros((), jnp.int32), *jnp.zeros((2,), bool)))
     return run_loop(Task(_change_first, (elements,)), None, problem, Given(), begin).state
 
 
@@ -202,13 +204,15 @@ def _change_first(elements: Elements, _, problem: Problem, choice: Choice, __) -
         stick=(mode.stick | (penetrates & sticks) | turns) & ~pulls & ~leaves & rough,
         negative=mode.negative != reverses,
     )
-    # Directions follow when the modes agree.
-    angle = max(_ANGLE, 4 * float(jnp.finfo(slip.dtype).eps))
-    moves = (jnp.sum((turned - slip) ** 2, 1) > angle**2) & ~wrong.any()
+    # Directions follow when the modes agree, to rounding as long as each change of them is smaller than the one before.
+    rounding = 4 * float(jnp.finfo(slip.dtype).eps)
+    angles = jnp.sum((turned - slip) ** 2, 1)
+    turn = jnp.max(angles)
+    moves = (angles > jnp.where(turn < choice.turn, rounding, max(_ANGLE, rounding)) ** 2) & ~wrong.any()
     slip = jnp.where(leaves[:, None], against, jnp.where(moves[:, None], turned, slip))
     changes = changes + jnp.where(wrong.any(), _WEIGHT, 1).astype(jnp.int32)
     done = ~(wrong.any() | moves.any()) | (changes >= _WEIGHT * max_changes(elements))
-    return Iteration(Choice(changed, slip, changes, wrong.any(), done), ~choice.done, ~done)
+    return Iteration(Choice(changed, slip, turn, changes, wrong.any(), done), ~choice.done, ~done)
 
 
 def max_changes(elements: Elements) -> int:
