@@ -128,8 +128,9 @@ def compile_each(module: dict[str, Any]) -> None:
     """
 
     def accepting(function):
-        static = {"sequence"} & set(inspect.signature(function).parameters)
-        program = jax.jit(function, static_argnames=tuple(static), inline=True)
+        # Text is no argument of a program.
+        takes_text = "sequence" in inspect.signature(function).parameters
+        program = function if takes_text else jax.jit(function, inline=True)
 
         @functools.wraps(function)
         def call(*args, **options):
