@@ -1,5 +1,6 @@
 """Known and traced leaves of pytrees, and functions that keep known values known."""
 
+import contextlib
 import functools
 import hashlib
 from collections.abc import Callable
@@ -44,6 +45,15 @@ _asked_p = define_primitive(
 def is_tracing() -> bool:
     """Decide whether a program is being traced, so that operations on known arrays give tracers too."""
     return isinstance(lax.neg(1) if _asked_p is None else _asked_p.bind(), Tracer)
+
+
+def evaluate_known() -> contextlib.AbstractContextManager[None]:
+    """Context in which operations on known numbers have known results, also while a program is traced.
+
+    Outside of traces they have, and there the context of JAX would make a program of each known operation of a function that is
+    compiled within it.
+    """
+    return jax.ensure_compile_time_eval() if is_tracing() else contextlib.nullcontext()
 
 
 def is_known(*trees) -> bool:

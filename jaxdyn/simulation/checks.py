@@ -7,12 +7,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxdyn.compile.known import is_concrete, once
+from jaxdyn.compile.known import evaluate_known, is_concrete, once
 from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import MIN_GAP
@@ -281,7 +280,7 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
     selection = select_rows(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
-    with jax.ensure_compile_time_eval():  # known numbers stay known while a function around is traced
+    with evaluate_known():  # known numbers stay known while a function around is traced
         selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
     ratio = start_openness(selected, relative=limit)(q, v, t)
     if ratio <= 1 and selection.rounding > max_rounding(q.dtype):
@@ -310,7 +309,7 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     if not isinstance(method, Reduced):
         return selected, method
     # Inside a jit, jax would trace operations on known numbers too.
-    with jax.ensure_compile_time_eval():
+    with evaluate_known():
         q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
         # At a singular position the rows that are kept leave more velocities than the mechanism has elsewhere.
         free = count_free(scene, q, t, method.rank_tol) if selected is scene else scene.nv - rank
