@@ -269,6 +269,23 @@ for _ in range(2):
     jd.simulate(scene, *start[:2], np.linspace(0.0, 0.1, 3))
 assert [name for name in names if "lambda" not in name] == ["jit_smooth_motion"], names
 """,
+    # They were 141: each operation on numbers of the model was one.
+    "a first assembly of a rounded mechanism compiles few programs": """
+import jax
+import numpy as np
+import jaxdyn as jd
+bar, events = (1.0, (0.1, 0.0, 0.0), (0.1, 0.1, 0.1)), []
+builder = jd.ModelBuilder("four-bar")
+builder.add_body("crank", None, "revolute", bar, axis=(0, 0, 1))
+builder.add_body("coupler", "crank", "revolute", bar, axis=(0, 0, 1), pose=(0.3, 0.0, 0.0))
+builder.add_body("rocker", None, "revolute", bar, axis=(0, 0, 1), pose=(1.0, 0.0, 0.0))
+loop = jd.loop("coupler", (0.9, 0.0, 0.0), "rocker", (0.6, 0.0, 0.0))
+scene = jd.Scene(builder.build().replace(rounding=5e-5), [loop])
+jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: events.append(event))
+assert jd.assemble(scene, np.array([0.5, 0.8, 1.6])).success
+count = sum(event.endswith("backend_compile_duration") for event in events)
+assert 0 < count <= 20, count
+""",
 }
 
 
