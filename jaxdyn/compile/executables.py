@@ -21,7 +21,7 @@ from jaxdyn.compile import disk, jax_adapter, mode, stored
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.jax_adapter import select_options
 from jaxdyn.compile.kernels import call_program
-from jaxdyn.compile.known import evaluate_known, is_concrete, is_tracing, partition
+from jaxdyn.compile.known import is_concrete, is_tracing, keep_known, partition
 from jaxdyn.compile.mode import phase
 from jaxdyn.compile.primitive import target
 from jaxdyn.compile.trace import program_of, trace_program
@@ -296,7 +296,7 @@ class Evaluation:
                 except Exception as error:
                     if not isinstance(error, target.Unsupported) and not jax_adapter.forgive(error):
                         raise
-        with evaluate_known():
+        with keep_known():
             return jax.tree.map(np.asarray, self.function(*self.static, self.tree, *map(jnp.asarray, args)))
 
     def _find(self, structure, leaves) -> tuple | None:

@@ -47,7 +47,7 @@ def is_tracing() -> bool:
     return isinstance(lax.neg(1) if _asked_p is None else _asked_p.bind(), Tracer)
 
 
-def evaluate_known() -> contextlib.AbstractContextManager[None]:
+def keep_known() -> contextlib.AbstractContextManager[None]:
     """Context in which operations on known numbers have known results, also while a program is traced.
 
     Outside of traces they have, and there the context of JAX would make a program of each known operation of a function that is

@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxdyn.compile import Evaluation, entry_point, kernel, mark_invalid
-from jaxdyn.compile.known import evaluate_known, is_concrete, once, stop_gradient
+from jaxdyn.compile.known import is_concrete, keep_known, once, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.rank import (
@@ -159,7 +159,7 @@ def select_rows(scene: Scene, q, t: Numbers, rank_tol: float | None = None) -> S
         # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
         if not every.kept.size or not has_doubtful_rows(*place):
             return every
-        with evaluate_known():
+        with keep_known():
             chosen = _select(scene.without_forces, *map(jnp.asarray, place), rank_tol)
         return Selection(*map(np.asarray, chosen))  # pyright: ignore[reportArgumentType]
     bare = stop_gradient(scene.without_forces)

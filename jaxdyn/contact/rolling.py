@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.compile import kernel
-from jaxdyn.compile.known import evaluate_known, is_known
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.frames import Pair, displace_pose, each, relative_motions, relative_poses
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.constraints.rolling import Touching, TouchingPoint, check_has_rows, tangents
@@ -378,9 +378,7 @@ def _closeness(system: RollingModel, q):
 def _check_places(system: RollingModel, q, what: str, fix: str) -> None:
     if not is_known(system, q):
         return
-    # Within a trace the result would be traced even for concrete numbers, and could not be tested.
-    with evaluate_known():
-        strict, residuals = map(np.asarray, _closeness(system, jnp.asarray(q)))
+    strict, residuals = map(np.asarray, _closeness(system, jnp.asarray(q)))
     for contact, is_strict, off in zip(system.contacts, strict, residuals, strict=True):
         if not is_strict:
             raise ValueError(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.constraints.rank import eps_of
 from jaxdyn.dynamics.quantities import torque_regressor
 from jaxdyn.identify.descent import Watch, descend
 from jaxdyn.identify.excitation import (
@@ -306,7 +307,7 @@ def _loss(scaled, args):
     ]
     if task.robot.motors is not None:
         # Near a dead point speeds have no bound, beyond it the loops stay open: such motions are left out.
-        excess = [*(jnp.max(x) for x in over), jnp.max(gap) - float(jnp.finfo(gap.dtype).eps) ** _CLOSED]
+        excess = [*(jnp.max(x) for x in over), jnp.max(gap) - eps_of(gap) ** _CLOSED]
         return jnp.where(jnp.max(jnp.stack(excess)) <= 0, value, jnp.inf)
     return value + 100 * sum(jnp.mean(jnp.maximum(x, 0) ** 2) for x in over)
 
@@ -349,7 +350,7 @@ def _limit_shares(motion: FourierMotion, task: _Task) -> dict[str, float]:
         "position": np.abs(q - (lower + upper) / 2) / ((upper - lower) / 2),
         "velocity": np.abs(v) / speed,
         "torque": np.abs(tau) / torque,
-        "closure": gap / float(jnp.finfo(times.dtype).eps) ** _CLOSED,
+        "closure": gap / eps_of(times) ** _CLOSED,
     }
     # Newton's method on loops that cannot be closed may leave the numbers.
     return {name: float(np.nan_to_num(values, nan=np.inf).max()) for name, values in sizes.items()}

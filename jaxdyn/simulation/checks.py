@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxdyn.compile.known import evaluate_known, is_concrete, once
+from jaxdyn.compile.known import is_concrete, keep_known, once
 from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import MIN_GAP
@@ -280,7 +280,7 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
     selection = select_rows(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
-    with evaluate_known():  # known numbers stay known while a function around is traced
+    with keep_known():  # known numbers stay known while a function around is traced
         selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
     ratio = start_openness(selected, relative=limit)(q, v, t)
     if ratio <= 1 and selection.rounding > max_rounding(q.dtype):
@@ -309,7 +309,7 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     if not isinstance(method, Reduced):
         return selected, method
     # Inside a jit, jax would trace operations on known numbers too.
-    with evaluate_known():
+    with keep_known():
         q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
         # At a singular position the rows that are kept leave more velocities than the mechanism has elsewhere.
         free = count_free(scene, q, t, method.rank_tol) if selected is scene else scene.nv - rank

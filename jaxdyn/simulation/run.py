@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import entry_point
-from jaxdyn.compile.known import as_constant, as_numpy_if_known, evaluate_known, is_concrete, is_known, is_tracing, once
+from jaxdyn.compile.known import as_constant, as_numpy_if_known, is_concrete, is_known, is_tracing, keep_known, once
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype, warn
 from jaxdyn.simulation import checks, controls
@@ -242,7 +242,7 @@ def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool, c
     q0, v0, ts = start
 
     def check_system():
-        with evaluate_known():
+        with keep_known():
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
 
     is_readable = concrete or is_concrete((scene, start))
